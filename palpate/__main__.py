@@ -13,7 +13,7 @@ from palpate.environment import FIXED
 from palpate_errors import ExitStatus
 
 TERMINALS = [number for number in (0, 1, 2) if os.isatty(number)]
-"""Those of standard input, output and error that are terminals."""
+"""File descriptors of standard input, output and error that are terminals."""
 
 
 def main() -> None:

@@ -140,7 +140,7 @@ def _options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """With a callback, an app of one command still requires that command's name."""
+    """Callback of the app: with it, an app of one command still requires that command's name."""
 
 
 def _listed() -> None:

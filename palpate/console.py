@@ -133,11 +133,11 @@ def _output(text: str, names: tuple[str, ...], folder: bool) -> typer.models.Opt
     return option
 
 
-def wide_console(least: int = 0) -> Console:
-    """Return a console on standard output with `least` columns at least, and 140 if it is a pipe, so that tables stay whole."""
+def wide_console(min_width: int = 0) -> Console:
+    """Return a console on standard output of at least `min_width` columns, and 140 if it is a pipe, so that tables stay whole."""
     plain = SteadyConsole(highlight=False)
-    least = max(least, 0 if plain.is_terminal else 140)
-    return plain if plain.width >= least else SteadyConsole(highlight=False, width=least)
+    min_width = max(min_width, 0 if plain.is_terminal else 140)
+    return plain if plain.width >= min_width else SteadyConsole(highlight=False, width=min_width)
 
 
 _DOCUMENT: TextIO | None = None

@@ -147,4 +147,4 @@ def simulate(
         return
     write_csv(probing, out.with_suffix(".csv"))
     plot_probing(probing, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
-    console.print(f"{out}: greatest force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm", highlight=False)
+    console.print(f"{out}: maximum force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm", highlight=False)

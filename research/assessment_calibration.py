@@ -53,7 +53,7 @@ NONE: Final = -20.0
 CLASSES: Final = ((1.05, 1.3), (1.3, 1.5), (1.5, 2.0), (2.0, 20.0))
 """Classes of felt contrast."""
 WIDE_M: Final = 0.015
-"""Least felt radius of a separate class [m]."""
+"""Minimum felt radius of a separate class [m]."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class WeighedPatient:
 
     seed: int
     features: list[list[float]]
-    """Of the candidates that are weighed."""
+    """Features of the candidates that are weighed."""
     signs: list[list[float]]
-    """Of muscles about them."""
+    """Signs of muscles about them."""
     structures: list[list[float]]
     """Evidence for structures instead."""
     real: list[bool]
@@ -134,8 +134,8 @@ def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration
 
     weights = minimize(loss, np.zeros(features.shape[1] + 1), method="BFGS").x
     new = calibration.model_copy(update={"probability": tuple(np.round(weights, 3).tolist())})
-    greatest = np.sort([reported(c, new).max(initial=NONE) for c in cases if c.contrast < 1 + PALPABLE])
-    tail = greatest[-round(_TAIL * len(greatest)) :]
+    highest = np.sort([reported(c, new).max(initial=NONE) for c in cases if c.contrast < 1 + PALPABLE])
+    tail = highest[-round(_TAIL * len(highest)) :]
     scale = max(float(tail.mean() - tail[0]), 0.1)
     location = float(tail[0]) + scale * float(np.log(_TAIL))
     return new.model_copy(update={"tail": (round(location, 3), round(scale, 3))})
@@ -162,11 +162,11 @@ def evaluate(cases: list[WeighedPatient], calibration: Calibration, false_findin
     healthy = [bool((q >= threshold).any()) for q, c in zip(logits, cases, strict=True) if c.contrast < 1 + PALPABLE]
     print(f"healthy with a finding: {_part(healthy)}")
     for low, high in CLASSES:
-        for name, least in (("", 0.0), (f", felt radius {1e3 * WIDE_M:.0f} mm or more", WIDE_M)):
+        for name, min_radius in (("", 0.0), (f", felt radius {1e3 * WIDE_M:.0f} mm or more", WIDE_M)):
             found = [
                 bool((q[np.array(c.real, dtype=bool)] >= threshold).any())
                 for q, c in zip(logits, cases, strict=True)
-                if low <= c.contrast < high and c.radius_m >= least
+                if low <= c.contrast < high and c.radius_m >= min_radius
             ]
             print(f"felt contrast {low} to {high}{name}: found {_part(found)}")
     every, real = np.concatenate(logits), _every(cases)[1]

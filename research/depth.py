@@ -21,8 +21,8 @@ from palpate_models.numerics.frames import Array
 from palpate_validation.check import COLOURS, write_figure
 
 STATES, TRUTH = "exam/state", "truth/indentation"
-FEWEST = 20
-"""Least number of states of a stroke."""
+ENOUGH = 20
+"""Minimum number of states of a stroke."""
 PRESSED_M = 0.002
 """Depth from which a press has an after-effect [m]."""
 NEAR_M = 0.014
@@ -44,7 +44,7 @@ class Depths:
 
     def by_stroke(self) -> tuple[float, float]:
         """Standard deviation [m] of the strokes' mean errors, and root mean square of what is left within strokes."""
-        strokes = [self.error[self.stroke == k] for k in np.unique(self.stroke) if np.count_nonzero(self.stroke == k) >= FEWEST]
+        strokes = [self.error[self.stroke == k] for k in np.unique(self.stroke) if np.count_nonzero(self.stroke == k) >= ENOUGH]
         return float(np.std([e.mean() for e in strokes])), float(np.sqrt(np.mean([e.var() for e in strokes])))
 
 
@@ -100,7 +100,7 @@ def met_by(began: Mapping[int, float], truth: Array) -> list[Met]:
 
 
 def contact_summary(met: Sequence[Met]) -> str:
-    """In a sentence."""
+    """Return a sentence about the contacts."""
     depth, pressed = (np.array(column) for column in zip(*met, strict=True))
     parts = []
     for which, where in ((~pressed, "where it was not pressed before"), (pressed, "near earlier presses")):

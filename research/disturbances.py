@@ -24,7 +24,7 @@ from palpate_models.patient.schema import Background, Build, Phantom, Stiffness
 from research.felt_scans import ScanErrors, felt_samples
 
 TYPICAL: Final = ScanErrors(stroke_m=7e-4, field_m=5e-4, breathing_m=7e-4, tare_n=0.05)
-"""As the assessment's calibration has them."""
+"""Errors of the assessment's calibration."""
 CLEAN: Final = ScanErrors()
 DEFAULT: Final = Phantom()
 REGION_M: Final = 0.2

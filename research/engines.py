@@ -12,7 +12,7 @@ from research.contact_rig import Delays, press
 
 
 class Comparison(NamedTuple):
-    """The same press in both engines."""
+    """One press in both engines."""
 
     force_n: float
     """Mean force at the end in DART."""

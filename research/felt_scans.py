@@ -14,7 +14,7 @@ from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.seeds import generator
 
 FIELD_LENGTH_M: Final = 0.015
-"""As whole examinations have it: what touches leave of the error of the perceived surface."""
+"""Correlation length of the surface error that touches leave, as in whole examinations [m]."""
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,9 @@ class Weighed:
     """A candidate."""
 
     logit: float
-    """Of a lump, by the calibration as it is."""
+    """Logit of a lump by the present calibration."""
     signs: list[float]
-    """Of a muscle."""
+    """Signs of a muscle."""
     softer: bool
     cause: TrueCause
 

@@ -5,7 +5,7 @@
 Backgrounds are Gaussian fields of one length each, scanned as `felt_scans` does; every second patient has a round lump somewhere.
 With the true covariance S of the samples and the bump b of a lump, t = b' S^-1 y / sqrt(b' S^-1 b) is the best test for that
 lump (Kay 1998, "Detection theory", ch. 4); the ideal observer uses its maximum over places and radii, which are unknown. The
-assessment uses the greatest logit of its candidates. Both are compared by the area under the ROC curve (AUC), with its
+assessment uses the highest logit of its candidates. Both are compared by the area under the ROC curve (AUC), with its
 95 % interval (Hanley and McNeil 1982), and by the lumps found where each gives 2 % of the healthy patients a finding (Wilson).
 """
 
@@ -47,7 +47,7 @@ FALSE_ALARMS: Final = 0.02
 RADII_M: Final = (0.012, 0.026)
 _LOOP: Final = loop_errors(load_scenario("person"))
 ERRORS: Final = ScanErrors(stroke_m=_LOOP.zero_m, field_m=_LOOP.field_m, breathing_m=_LOOP.wander_m, tare_n=0.05)
-"""As typical errors and breathing leave them in whole examinations."""
+"""Errors that typical equipment and breathing leave in whole examinations."""
 _CENTRES_M: Final = np.arange(-0.09, 0.0901, 0.01)
 
 
@@ -67,7 +67,7 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
 
 
 def ideal(o: Observations, length: float) -> float:
-    """Return the ideal observer's greatest |t| of a scan."""
+    """Return the ideal observer's maximum |t| of a scan."""
     apart, lever = cdist(o.xy, o.xy, "sqeuclidean"), np.outer(o.per_metre, o.per_metre)
     S = fixed_covariance(replace(o, depth_uncertainty=np.zeros(len(o.y))))
     S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
@@ -84,7 +84,7 @@ def ideal(o: Observations, length: float) -> float:
 
 
 def ours(o: Observations) -> float:
-    """Return the assessment's greatest logit of a scan; -20 where it weighs nothing."""
+    """Return the assessment's highest logit of a scan; -20 where it weighs nothing."""
     calibration = load_calibration()
     _, candidates = detect(o)
     return float(calibration.logit(np.array([c.features for c in candidates])).max()) if candidates else -20.0

@@ -20,7 +20,7 @@ from palpate.quick.case import run_quick
 from palpate_models.scenario.load import load_scenario
 
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""As a study's cases have it. Libraries read it when they are loaded."""
+"""Environment of a study's cases. Libraries read it when they are loaded."""
 
 
 def quick_cost(name: str, seed: int) -> dict[str, float]:

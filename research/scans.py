@@ -269,7 +269,7 @@ def main(seeds: int) -> None:
 
 
 def _spread(values: list[float | None], scale: float = 1.0) -> str:
-    """Mean, least and greatest."""
+    """Mean, minimum and maximum."""
     known = [scale * value for value in values if value is not None]
     return f"{np.mean(known):.3g} ({min(known):.3g} to {max(known):.3g})" if known else "-"
 

@@ -134,8 +134,8 @@ def collect(seeds: range, out: Path) -> None:
 def bound(alarms: list[str], hours: float) -> None:
     """Print the number of false alarms and the exact upper bound of their rate (95 %, Garwood)."""
     count = sum(map(bool, alarms))
-    most = chi2.ppf(0.95, 2 * count + 2) / 2 / hours
-    print(f"{len(alarms)} examinations, {hours:.2f} h, {count} with a false alarm: their rate is below {most:.1f} per hour")
+    bound = chi2.ppf(0.95, 2 * count + 2) / 2 / hours
+    print(f"{len(alarms)} examinations, {hours:.2f} h, {count} with a false alarm: their rate is below {bound:.1f} per hour")
 
 
 def main() -> None:

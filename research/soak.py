@@ -58,7 +58,7 @@ class Growth:
     examinations: int
     highest_mb: float
     percent_an_hour: float | None
-    """Of the mean; None with fewer than `MIN_EXAMINATIONS`."""
+    """Growth per hour in percent of the mean; None with fewer than `MIN_EXAMINATIONS`."""
     low: float | None
     """95 % interval."""
     high: float | None
@@ -173,7 +173,7 @@ def _processes(at_s: float, number: int) -> Iterator[ProcessSample]:
 def growth_table(growths: list[Growth]) -> str:
     """Markdown, a role a row."""
     rows = [
-        "| role | examinations | most memory [MB] | growth [% an hour] | open files, first and last |",
+        "| role | examinations | maximum memory [MB] | growth [% an hour] | open files, first and last |",
         "|---|---|---|---|---|",
     ]
     for growth in sorted(growths, key=lambda growth: -growth.highest_mb):
@@ -186,7 +186,7 @@ def growth_table(growths: list[Growth]) -> str:
 
 
 def draw(soaks: dict[str, list[ProcessSample]], path: Path) -> None:
-    """Write a PNG: for each soak, by its name, the most memory and open files of every role in each examination, and its memory
+    """Write a PNG: for each soak, the maximum memory and open files of every role in each examination, and its memory
     in the course of the examination in the middle.
     """
     figure = Figure(figsize=(11.0, 3.2 * len(soaks)), layout="constrained")
@@ -211,7 +211,7 @@ def draw(soaks: dict[str, list[ProcessSample]], path: Path) -> None:
 
 
 def _ended(samples: list[ProcessSample], growths: list[Growth]) -> list[ProcessSample]:
-    """Those of the examinations that came to their end."""
+    """Return the samples of the examinations that came to their end."""
     last = max(growth.examinations for growth in growths)
     return [sample for sample in samples if sample.number <= last]
 

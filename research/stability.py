@@ -42,9 +42,9 @@ class Stability:
     """All that was measured."""
 
     delay: dict[float, list[Ringing]]
-    """By contrast, one for each of `DELAYS_MS`, on all messages."""
+    """Ringing by contrast, one for each of `DELAYS_MS`, on all messages."""
     jitter: dict[float, list[Ringing]]
-    """The same with jitter from zero to the given milliseconds."""
+    """Ringing with jitter from zero to the given milliseconds."""
     margins: list[Margin]
     soft_across_ms: int
     """Theory's margin of the control path with a quarter of the stiffness across the tool, default wall."""
@@ -107,7 +107,7 @@ def section(found: Stability | None = None) -> PageSection:
         f"with K_z = {SOFTER_NPM[-1]:g} N/m: it is not the contact that turns over but the controller's spring across the tool, "
         f"for with a quarter of its 3000 N/m theory gives {found.soft_across_ms} ms. "
         f"The path between robot and tissue, which hardware does not have, bears {min(contact)} ms at least ({LARGEST_MS} were "
-        "tried). Jitter makes a message late by half of its most in the mean, so more of it is borne than of delay. Theory: the "
+        "tried). Jitter delays a message by half of its maximum in the mean, so more of it is borne than of delay. Theory: the "
         "arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
         "holds (crosses)."
     )

@@ -25,10 +25,10 @@ PAIRS: Final = 6
 
 
 class Cost(NamedTuple):
-    """Of one run, its start and report included."""
+    """Cost of one run, its start and report included."""
 
     processor_s: float
-    """Of all its processes."""
+    """Processor time of all its processes."""
     wall_s: float
 
 

@@ -8,7 +8,7 @@ from examination import Finished
 
 LOCALISED_M = 1.7e-3
 DICE = 0.80
-"""Of the area in which the lump is felt, which is wider than the lump."""
+"""Dice of the area in which the lump is felt, which is wider than the lump."""
 COVERAGE = 0.85
 HIGHEST_FORCE_N = 11.3
 DEPTH_RMS_M = 0.25e-3

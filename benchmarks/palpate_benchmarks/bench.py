@@ -106,6 +106,6 @@ def tables(figures: dict[str, Any]) -> list[Table]:
     for name, run in figures["runs"].items():
         for role, row in run["blame"].items():
             if row:
-                most = next(iter(row["waited_for"]), "")
-                blame.add_row(name, role, *(f"{row[column]:.0f}" for column in columns), most)
+                longest = next(iter(row["waited_for"]), "")
+                blame.add_row(name, role, *(f"{row[column]:.0f}" for column in columns), longest)
     return [table for table in (runs, blame) if table.row_count]

@@ -19,7 +19,7 @@ WHOLE_RUN_KINDS: Final = (*SCARCE_KINDS, "partition")
 """Kinds that apply to a whole run; so do `kill` and `freeze` of conductor, recorder, dashboard or several roles."""
 LIE: Final = "lie"
 KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *WHOLE_RUN_KINDS, LIE)
-"""Of the others, process kinds apply to one service, message kinds and `lie` to one topic."""
+"""All kinds. Process kinds apply to one service, message kinds and `lie` to one topic, except as said above."""
 
 
 class CampaignLimits(NamedTuple):

@@ -59,14 +59,14 @@ LIVE_KINDS: Final = ("zero", "stale")
 class LieTuning(NamedTuple):
     """Times of a lie's case, and limits of its outcome."""
 
-    least_share: float = 0.9
+    min_share: float = 0.9
     """Share of the twin's targets that a complete examination has felt."""
     same_background: float = 0.25
     """Relative change of the map's background that counts as harm."""
     longest_ns: int = 180 * NS
     """Simulated time after which a case has hung."""
     case_s: float = 900.0
-    """Wall time of a case at most."""
+    """Maximum wall time of a case."""
     before_s: float = 0.25
     """A case of old messages is forked this long before its lie, so that the liar has some."""
     never_ns: int = 10**18
@@ -100,7 +100,7 @@ class Healthy(NamedTuple):
     """Number of targets."""
     findings: int
     background: float
-    """Of the map [N]."""
+    """Background of the map [N]."""
     length_s: float
 
 
@@ -327,7 +327,7 @@ def judge(result: CaseResult, lie: Lie, log: FaultLog, twin: Healthy) -> CaseRes
     felt, findings, background = _felt(collected)
     if failure is not None:
         result.ended = str(failure)
-    elif felt < LIES.least_share * twin.felt:
+    elif felt < LIES.min_share * twin.felt:
         message = collected.exam.message if collected.exam else ""
         result.ended = f"without a failure, {felt} of {twin.felt} targets felt: {message}"
     elif findings == twin.findings and abs(background - twin.background) <= LIES.same_background * twin.background:

@@ -101,7 +101,7 @@ class Drop(NamedTuple):
 
     @property
     def deepest(self) -> float:
-        """Greatest depth [m]."""
+        """Maximum depth [m]."""
         return float(self.depth.max())
 
     @property

@@ -94,9 +94,9 @@ def section(curves: HertzCurves | None = None) -> PageSection:
     calibrated = curves.error[curves.radii.index(HERTZ.calibrated_radius_m)]
     inside = (curves.depths >= HERTZ.range_m[0] - 1e-9) & (curves.depths <= HERTZ.range_m[1] + 1e-9)
     low_mm, high_mm, radius_mm = (1e3 * x for x in (*HERTZ.range_m, HERTZ.calibrated_radius_m))
-    largest, most = 100 * float(np.abs(calibrated[inside]).max()), 100 * HERTZ.tolerance
+    largest, limit = 100 * float(np.abs(calibrated[inside]).max()), 100 * HERTZ.tolerance
     name = f"largest error over {low_mm:g} to {high_mm:g} mm at R = {radius_mm:g} mm"
-    checks, ranges = [Check(name, largest, "%", high=most, against="Hertz, 10 kPa, nu 0.49")], []
+    checks, ranges = [Check(name, largest, "%", high=limit, against="Hertz, 10 kPa, nu 0.49")], []
     for radius, error in zip(curves.radii, curves.error, strict=True):
         (low, high), name = curves.within(radius), f"R = {radius * 1e3:g} mm"
         at_ten = float(np.interp(0.010, curves.depths, error))
@@ -144,12 +144,12 @@ def elastic_section() -> PageSection:
     hertz = np.array([hertz_force(ELASTIC_DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in HERTZ.radii_m])
     sneddon = forces(lambda radius, depth: sneddon_force(depth, radius, HERTZ.young_pa, slab.poisson))
     by_hertz, by_sneddon = 100 * (paraboloid / hertz - 1), 100 * (sphere / sneddon - 1)
-    at, most = int(np.argmin(np.abs(ELASTIC_DEPTHS_M - 0.005))), HERTZ.elastic_percent
+    at, limit = int(np.argmin(np.abs(ELASTIC_DEPTHS_M - 0.005))), HERTZ.elastic_percent
     power = float(np.polyfit(np.log(HERTZ.radii_m), np.log(paraboloid[:, at]), 1)[0])
     checks = (
-        Check("paraboloid, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_hertz).max()), "%", high=most,
+        Check("paraboloid, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_hertz).max()), "%", high=limit,
               against="Hertz"),
-        Check("sphere, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_sneddon).max()), "%", high=most,
+        Check("sphere, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_sneddon).max()), "%", high=limit,
               against="Sneddon"),
         Check("exponent of the force in the radius", power, "", 0.48, 0.52, "Hertz: 0.5"),
         Check("sphere at 10 mm depth, R = 20 mm, against the paraboloid's law",

@@ -30,7 +30,7 @@ class MeshSetup(NamedTuple):
     """Edges of the default mesh and of a mesh of half the edge."""
     radii_m: tuple[float, float] = (0.015, 0.020)
     from_m: float = 0.005
-    """Least depth of the bound: shallower contacts are as small as an edge."""
+    """Minimum depth of the bound: shallower contacts are as small as an edge."""
     lumps_m: tuple[float, float, float] = (0.010, 0.020, 0.030)
     contrasts: tuple[float, float, float] = (2.0, 4.0, 10.0)
     lump_edge_m: float = 0.008

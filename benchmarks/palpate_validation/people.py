@@ -214,8 +214,8 @@ def _exponents(places: Sequence[Place]) -> Iterator[Check]:
         measured = float(np.median([exponent(np.interp(depths, COMPARED_M, p.measured)) for p in places]))
         simulated = float(np.median([exponent(np.interp(depths, COMPARED_M, p.simulated)) for p in places]))
         name = f"median exponent of force over depth, {1e3 * low:g} to {1e3 * high:g} mm"
-        least, most = round(measured - BOUNDS.exponent_within, 3), round(measured + BOUNDS.exponent_within, 3)
-        yield Check(name, simulated, "", least, most, f"measured: {measured:.2f}")
+        lowest, highest = round(measured - BOUNDS.exponent_within, 3), round(measured + BOUNDS.exponent_within, 3)
+        yield Check(name, simulated, "", lowest, highest, f"measured: {measured:.2f}")
 
 
 def _tension_ratio(places: Sequence[Place]) -> Check:

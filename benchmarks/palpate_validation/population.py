@@ -25,7 +25,7 @@ class PopulationSetup(NamedTuple):
     persons: int = 200
     places: int = 5
     apart_m: float = 0.04
-    """Least distance between positions on a person."""
+    """Minimum distance between positions on a person."""
 
 
 SETUP = PopulationSetup()

@@ -51,9 +51,9 @@ def _ending(_: bytes) -> bool:
     ("check", "sign"), [(_outside, "opens for writing"), (_large, "MemoryError"), (_ending, "the process left with status 7")]
 )
 def test_what_leaves_its_confines_is_found(check: Callable[[bytes], bool], sign: str) -> None:
-    done = campaign([FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, most=1))[
-        "wrong"
-    ]
+    done = campaign(
+        [FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, max_found=1)
+    )["wrong"]
     assert [sign in find.error for find in done.finds] == [True]
 
 

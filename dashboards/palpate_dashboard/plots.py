@@ -103,7 +103,7 @@ MODES: Final = (("idle", (120, 130, 145)), ("active", (70, 190, 90)), ("safe hol
 """Driver modes by number (RobotStatus.MODE_*)."""
 
 LEVEL_COLORS: Final = ((70, 190, 90), (240, 200, 60), (220, 40, 40), (120, 130, 145))
-"""In the order of `text.LEVELS`."""
+"""Colours of `text.LEVELS`, in their order."""
 _LOG_LEVELS: Final = {"warning": "WARN", "ERROR": "ERROR"}
 
 JOINT_COLORS: Final = (

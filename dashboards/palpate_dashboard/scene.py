@@ -31,9 +31,9 @@ class SceneTuning(NamedTuple):
     resolution_m: float = 2e-4
     """Vertices are rounded to this, so that resting ones are bit-identical and compress to nothing."""
     cloud_points: int = 6000
-    """Greatest number of drawn points of the perceived cloud."""
+    """Maximum number of drawn points of the perceived cloud."""
     carry_m: float = 0.012
-    """Greatest distance from a vertex of the abdomen to the map vertex that colours it."""
+    """Maximum distance from a vertex of the abdomen to the map vertex that colours it."""
     trail_step_m: float = 0.001
     """Distance between points of the travelled path."""
 

@@ -49,7 +49,7 @@ class ViewPeriods(NamedTuple):
     send_ns: int = 1000 * MS
     """Simulated time per chunk of the file."""
     send_live_ns: int = 200 * MS
-    """The same with a live viewer."""
+    """Simulated time per chunk with a live viewer."""
 
 
 PERIODS = ViewPeriods()

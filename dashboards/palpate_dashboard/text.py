@@ -23,7 +23,7 @@ CONTACT_FLAGS = ("in_contact", "steady", "force_limited", "view_blocked")
 FREE_M = -0.02
 """At a smaller depth the tool is off the skin, and the force reading is sensor bias."""
 OTHERS_SHOWN = 0.05
-"""Least probability of another cause that is shown with a finding."""
+"""Minimum probability of another cause that is shown with a finding."""
 
 LEGEND = """
 | in the scene | |

@@ -36,7 +36,7 @@ def _ordered(ends: tuple[Any, Any]) -> tuple[Any, Any]:
 
 
 Ends = Annotated[tuple[_T, _T], AfterValidator(_ordered)]
-"""Least and greatest value of a range."""
+"""Minimum and maximum of a range."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 

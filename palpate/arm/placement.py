@@ -37,7 +37,7 @@ class PlacementTuning(NamedTuple):
 
 PLACEMENT: Final = PlacementTuning()
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
-"""Least and largest x, y and height [m] and yaw [rad] of the base."""
+"""Minimum and maximum x, y and height [m] and yaw [rad] of the base."""
 STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))
 """Placements to start from; the best result counts, as the problem is not convex."""
 
@@ -66,7 +66,7 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 
 
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
-    """Return the robot on the base placement with the least cost over the scenario's region.
+    """Return the robot on the base placement with the lowest cost over the scenario's region.
 
     It is rounded to centimetres and hundredths of a radian. Raises RunError if no start converges.
     """
@@ -136,7 +136,7 @@ def describe(robot: Robot, postures: PostureSequence) -> str:
         return f"{head}: reaches none of {len(reached)} targets"
     return (
         f"{head}: reaches {reached.sum()} of {len(reached)} targets; "
-        f"least joint margin {np.rad2deg(postures.margin[reached].min()):.1f} deg, "
+        f"minimum joint margin {np.rad2deg(postures.margin[reached].min()):.1f} deg, "
         f"largest torque {100 * postures.torque_fraction[reached].max():.0f} % of its limit, "
-        f"least dexterity {postures.dexterity[reached].min():.2f}"
+        f"minimum dexterity {postures.dexterity[reached].min():.2f}"
     )

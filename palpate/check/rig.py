@@ -131,7 +131,7 @@ class Rig(ABC):
 
     @property
     def slack_s(self) -> float:
-        """The same [s]."""
+        """Allowance for transport and scheduling [s]; 0 in simulated time."""
         return self.slack / 1e9
 
     # -- checks
@@ -155,11 +155,11 @@ class Rig(ABC):
         """Record that a value is below a limit; the report has both times `scale`, in `unit`."""
         return self.expect(name, bool(value < limit), f"below {scale * limit:.3g} {unit}", f"{scale * value:.3g} {unit}")
 
-    def within(self, name: str, values: Any, least: float, most: float, unit: str) -> bool:
-        """Record that all `values` are from `least` to `most`, and that there are any."""
+    def within(self, name: str, values: Any, low: float, high: float, unit: str) -> bool:
+        """Record that all `values` are from `low` to `high`, and that there are any."""
         v = np.atleast_1d(np.asarray(values, dtype=float))
         got = f"{v.min():.3g} to {v.max():.3g} {unit}" if v.size else "nothing"
-        return self.expect(name, bool(v.size and np.all((v >= least) & (v <= most))), f"{least:.3g} to {most:.3g} {unit}", got)
+        return self.expect(name, bool(v.size and np.all((v >= low) & (v <= high))), f"{low:.3g} to {high:.3g} {unit}", got)
 
     def arrives(self, name: str, received: object, wanted: object) -> bool:
         """Record that something was received."""

@@ -34,7 +34,7 @@ class CompareTuning(NamedTuple):
     log_force: float = 0.1
     near_m: float = 0.005
     """Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
-    least_places: int = 10
+    min_places: int = 10
     confidence: float = 0.9
     resamples: int = 2000
 
@@ -122,7 +122,7 @@ class Compared(NamedTuple):
     figures: MapAgreement
     a: ComparedPalpation
     b: ComparedPalpation
-    """In the frame of A."""
+    """Palpation B in the frame of A."""
     of_a: Array
     """Map of A at the places [N], shape (k,)."""
     of_b: Array
@@ -142,8 +142,8 @@ def compare(a: ComparedPalpation, b: ComparedPalpation, register: bool | None = 
     of_a, lower, upper = (_on(a, values)(xy) for values in (a.map.apparent, a.map.lower, a.map.upper))
     of_b = _on(moved, b.map.apparent)(xy)
     there = np.isfinite(of_a) & np.isfinite(of_b) & (b.force > 0)
-    if there.sum() < TUNING.least_places:
-        raise UserError(f"{a.name}, {b.name}: {there.sum()} places in common, at least {TUNING.least_places} are needed")
+    if there.sum() < TUNING.min_places:
+        raise UserError(f"{a.name}, {b.name}: {there.sum()} places in common, at least {TUNING.min_places} are needed")
     of_a, of_b, lower, upper, force = (values[there] for values in (of_a, of_b, lower, upper, b.force))
     ratio = np.log(of_b / of_a)
     level = float(np.exp(np.median(ratio)))

@@ -3,7 +3,7 @@
 R_i is the outcome of body i on hardware and S_i in simulation. Mean maximum rank violation: the mean over i of the largest
 |R_i - R_j| of a pair whose order the simulation reverses (Li et al., Evaluating Real-World Robot Manipulation Policies in
 Simulation, arXiv 2405.05941). Prediction-powered mean of the outcome on hardware, with bodies that were only simulated, as in
-SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S of the pairs), with the lambda of least variance
+SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S of the pairs), with the lambda of minimum variance
 (Angelopoulos, Duchi and Zrnic, PPI++, arXiv 2311.01453).
 """
 
@@ -19,7 +19,7 @@ from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
 COLUMNS = ("body", "real", "simulated")
-LEAST_PAIRS = 3
+MIN_PAIRS = 3
 
 
 class SimToReal(NamedTuple):
@@ -36,7 +36,7 @@ class SimToReal(NamedTuple):
     mean_90: tuple[float, float]
     """Interval of the mean outcome on hardware, from hardware alone (Student's t)."""
     prediction_powered_90: tuple[float, float]
-    """The same with the simulated bodies."""
+    """Interval of the mean outcome on hardware, with the simulated bodies added."""
     weight: float
     """lambda [1]: 0 if the simulation predicts nothing."""
 
@@ -57,8 +57,8 @@ def read_outcomes(path: Path) -> tuple[Array, Array, Array]:
     if not np.isfinite(simulated).all():
         raise UserError(f"{path}: column simulated has gaps; want a number for each body")
     paired = np.isfinite(real)
-    if paired.sum() < LEAST_PAIRS:
-        raise UserError(f"{path}: {paired.sum()} bodies with real and simulated; at least {LEAST_PAIRS} are needed")
+    if paired.sum() < MIN_PAIRS:
+        raise UserError(f"{path}: {paired.sum()} bodies with real and simulated; at least {MIN_PAIRS} are needed")
     return real[paired], simulated[paired], simulated[~paired]
 
 
@@ -87,7 +87,7 @@ def sim_to_real(real: Array, simulated: Array, more: Array, confidence: float = 
 
 
 def _weight(real: Array, simulated: Array, more: Array) -> float:
-    """Return the lambda of least variance, in [0, 1]; 0 without bodies that were simulated only."""
+    """Return the lambda of minimum variance, in [0, 1]; 0 without bodies that were simulated only."""
     if len(more) < 2 or np.ptp(simulated) == 0:
         return 0.0
     variance = np.concatenate((simulated, more)).var(ddof=1) * (1 + len(real) / len(more))

@@ -58,7 +58,7 @@ class FuzzPlan(NamedTuple):
     seed: int = 0
     seconds: float = 3600.0
     """Processor time [s]."""
-    most: int = 100
+    max_found: int = 100
     """Finds after which it stops."""
     slow_s: float = LIMITS.slow_s
 
@@ -83,7 +83,7 @@ class TargetResult:
     seconds: float = 0.0
     """Processor time [s]."""
     peak_mb: int = 0
-    """Greatest resident memory of the process."""
+    """Maximum resident memory of the process."""
 
     def __str__(self) -> str:
         figures = f"{self.inputs} inputs, {self.refused} refused, {self.found} finds"
@@ -133,8 +133,8 @@ def _confine(target: FuzzTarget, seeds: Sequence[bytes], written: list[str]) -> 
     for data in seeds:  # first, since they import libraries
         attempt(target, data)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    most = pages * resource.getpagesize() + LIMITS.memory_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    limit = pages * resource.getpagesize() + LIMITS.memory_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     inside = f"{Path.cwd()}{os.sep}"
 
     def watch(event: str, arguments: tuple[Any, ...]) -> None:
@@ -153,7 +153,7 @@ def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> Ta
     pool = list(target.seeds(rng))
     _confine(target, pool, written)
     begin = process_time()
-    while result.inputs < plan.inputs and result.found < plan.most and process_time() - begin < plan.seconds:
+    while result.inputs < plan.inputs and result.found < plan.max_found and process_time() - begin < plan.seconds:
         number = place[0] = result.inputs
         data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
         if number % 997 == 0:
@@ -177,7 +177,7 @@ def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> Ta
 def campaign(
     chosen: Sequence[FuzzTarget], plan: FuzzPlan, progress: Callable[[int, int, str], None] = lambda *_: None
 ) -> dict[str, TargetResult]:
-    """Run each target in a child process; return the results by target. A target stops after `plan.most` finds.
+    """Run each target in a child process; return the results by target. A target stops after `plan.max_found` finds.
 
     Calls `progress` after each target with the number of finished targets, the number of all, and the result as text.
     """
@@ -217,8 +217,8 @@ def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
 
 def fuzz(
     names: Annotated[list[str] | None, typer.Argument(help="Targets or patterns, e.g. 'codec:*'; all by default.")] = None,
-    inputs: Annotated[int, typer.Option(min=1, help="Greatest number of inputs of each target.")] = 100_000,
-    seconds: Annotated[float, typer.Option(min=1, help="Greatest processor time of each target, in seconds.")] = 3600.0,
+    inputs: Annotated[int, typer.Option(min=1, help="Maximum number of inputs of each target.")] = 100_000,
+    seconds: Annotated[float, typer.Option(min=1, help="Maximum processor time of each target, in seconds.")] = 3600.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
 ) -> None:
     """Feed invalid bytes to everything that reads from the bus or from files, and check that all are refused."""

@@ -29,7 +29,7 @@ class DoctorLimits(NamedTuple):
 
     poll_s: float = 0.04
     min_shared_memory_mb: int = 64
-    """With less free shared memory, large messages may fall back to the network."""
+    """Minimum free shared memory: with less, large messages may fall back to the network."""
     min_message_age_ms: float = -2.0
     """A message with a smaller age was stamped by a clock that is ahead of the local one."""
     silent_s: float = 5.0

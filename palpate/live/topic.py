@@ -35,7 +35,7 @@ class TopicTimes(NamedTuple):
     bandwidth_periods: int = 5
     """Bandwidth is the mean over this many report periods."""
     spacing_messages: int = 10_000
-    """Messages over which rate and spacing are computed at most."""
+    """Maximum number of messages over which rate and spacing are computed."""
     shown_items: int = 12
     """Longer arrays are shortened in the output."""
 

@@ -46,7 +46,7 @@ class Seen(NamedTuple):
     """A patient as seen before the first touch, without the truth inside."""
 
     scenario: Scenario
-    """As given to the roles of the examination: without the patient, the seed and the errors of the equipment."""
+    """Scenario as given to the roles of the examination: without the patient, the seed and the errors of the equipment."""
     places: Array
     """Points of the skin at rest over the examined region [m], shape (n, 3), in A."""
     normals: Array
@@ -74,8 +74,8 @@ class Touch(NamedTuple):
 
     def __repr__(self) -> str:
         (x, y, _), seconds = self.position[0], PERIOD_S * len(self.time)
-        deepest, most = 1e3 * self.depth.max(), self.force.max()
-        return f"Touch({len(self.time)} instants in {seconds:.2f} s from ({x:.3f}, {y:.3f}) m, {deepest:.1f} mm, {most:.1f} N)"
+        deepest, highest = 1e3 * self.depth.max(), self.force.max()
+        return f"Touch({len(self.time)} instants in {seconds:.2f} s from ({x:.3f}, {y:.3f}) m, {deepest:.1f} mm, {highest:.1f} N)"
 
 
 class Patient:
@@ -211,9 +211,9 @@ class Patient:
 
     def _within_limits(self, depth: float, speed: float) -> None:
         limits = self.scenario.limits
-        for name, value, most, unit in (("depth", depth, limits.depth_m, "m"), ("speed", speed, limits.contact_speed_mps, "m/s")):
-            if not 0 < value <= most:
-                raise ValueError(f"{name} = {value} {unit}: want more than 0 and at most {most:g} {unit} (the scenario's limits)")
+        for name, value, high, unit in (("depth", depth, limits.depth_m, "m"), ("speed", speed, limits.contact_speed_mps, "m/s")):
+            if not 0 < value <= high:
+                raise ValueError(f"{name} = {value} {unit}: want more than 0 and at most {high:g} {unit} (the scenario's limits)")
 
     def _touch(self, xy: Array, depths: Array, descent: int) -> Touch:
         """`descent`: number of instants of the descent."""

@@ -17,12 +17,12 @@ HERTZ: Final = 1.5
 _FEW: Final = 10
 """Number of loadings from which on the power is fitted."""
 _CYCLES: Final = 5
-"""Least number of cycles of a slide that pushes in and out."""
+"""Minimum number of cycles of a slide that pushes in and out."""
 FOOTPRINT_SHARE: Final = 0.4
 """Share of the footprint's radius over which readings of a slide count as one place."""
 _SHORTEST_S: Final = 0.05
 _LOADED: Final = 0.95
-"""Share of the greatest depth up to which a press loads."""
+"""Share of the maximum depth up to which a press loads."""
 
 
 class ContactOnset(NamedTuple):
@@ -116,14 +116,14 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
     return Cut(touching, int((~near[lowest] & (rise > 0.5 * usual)).sum()))
 
 
-def peaks(values: Array, least: float) -> tuple[NDArray[np.intp], Array]:
-    """Return the maxima that rise by `least` over the minima on both sides: their indices, and the lesser rise; shape (k,)."""
+def peaks(values: Array, min_rise: float) -> tuple[NDArray[np.intp], Array]:
+    """Return the maxima that rise by `min_rise` over the minima on both sides: their indices, and the lesser rise; shape (k,)."""
     turns: list[tuple[int, float]] = []  # minima and maxima in turn, from a minimum to a minimum
     sign, at, extreme = -1.0, 0, np.inf
     for k, value in enumerate(values.tolist()):
         if sign * (value - extreme) > 0:
             at, extreme = k, value
-        elif sign * (extreme - value) >= least:
+        elif sign * (extreme - value) >= min_rise:
             turns.append((at, extreme))
             sign, at, extreme = -sign, k, value
     if sign < 0:
@@ -140,7 +140,7 @@ def _split(one: slice, at: NDArray[np.intp]) -> list[slice]:
 
 
 def loading(inward: Array) -> slice:
-    """Return the part of a contact up to its greatest depth; s [m], shape (k,)."""
+    """Return the part of a contact up to its maximum depth; s [m], shape (k,)."""
     deep = inward >= inward[0] + _LOADED * (inward.max() - inward[0])
     return slice(0, int(np.argmax(deep)) + 1)
 
@@ -152,10 +152,10 @@ def before_lift(inward: Array) -> slice:
 
 
 def cycles(position: Array, inward: Array, force: Array, radius: float) -> list[slice]:
-    """Return the stretches of a slide that pushes in and out: whole cycles, from one least force to a next one.
+    """Return the stretches of a slide that pushes in and out: whole cycles, from one minimum of the force to the next.
 
     A stretch is about as long as `FOOTPRINT_SHARE` of the footprint of a cycle. There is none if the force does not rise and fall
-    by more than its least value within a footprint of the path. Position [m], shape (k, 3); `inward` [m], `force` [N], (k,).
+    by more than its minimum within a footprint of the path. Position [m], shape (k, 3); `inward` [m], `force` [N], (k,).
     """
     low, high = np.quantile(force, (0.05, 0.95))
     troughs, _ = peaks(-force, 0.5 * (high - low))

@@ -147,7 +147,7 @@ class Mapping(Section):
     force: ForceSource = ForceSource()
     tool: MappedTool
     gravity_mps2: Vec3 = (0.0, 0.0, -9.81)
-    """In the frame of the positions."""
+    """Gravity in the frame of the positions."""
     body: MappedBody = MappedBody()
 
     @model_validator(mode="after")

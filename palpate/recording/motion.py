@@ -17,7 +17,7 @@ from palpate.recording.readings import Readings
 from palpate_models.numerics.frames import Array
 
 _LEAST_M2: Final = 1e-15
-"""Least variance of the positions within a part [m^2]."""
+"""Minimum variance of the positions within a part [m^2]."""
 Mask = NDArray[np.bool_]
 
 
@@ -26,7 +26,7 @@ class FreeMotionTuning(NamedTuple):
 
     block_s: float = 0.25
     """Duration over which force and motion are compared."""
-    fewest: int = 4
+    min_readings: int = 4
     """Readings of a block."""
     free_share: float = 0.2
     """Slope of force against motion in free air, as a share of that in contact."""
@@ -37,9 +37,9 @@ class FreeMotionTuning(NamedTuple):
     delay_s: float = 1.0
     """Largest delay that is sought."""
     correlation: float = 0.3
-    """Least correlation of force and motion at the delay."""
+    """Minimum correlation of force and motion at the delay."""
     gain: float = 0.85
-    """A delay is none if the correlation without it is at least this share of that with it."""
+    """A delay counts as zero if the correlation without it is at least this share of that with it."""
 
 
 TUNING: Final = FreeMotionTuning()
@@ -76,7 +76,7 @@ class Axis(NamedTuple):
 def blocks(time: Array) -> list[slice]:
     """Return the blocks of a recording over time."""
     step = float(np.median(np.diff(time)))
-    size = max(TUNING.fewest, round(TUNING.block_s / step))
+    size = max(TUNING.min_readings, round(TUNING.block_s / step))
     return [slice(k, k + size) for k in range(0, len(time) - size + 1, size)]
 
 
@@ -132,8 +132,8 @@ def delay(time: Array, height: Array, force: Array) -> float:
     inward = np.gradient(np.interp(even, time, -height))
     rise = np.gradient(np.interp(even, time, force))
     changes = np.abs(rise) > max(3 * noise(force), 1e-3 * float(np.abs(rise).max()))
-    most = 2 * float(np.median(np.abs(rise[changes]))) if changes.any() else 0.0
-    rise = np.where(changes, np.clip(rise, -most, most), 0.0)
+    max_rise = 2 * float(np.median(np.abs(rise[changes]))) if changes.any() else 0.0
+    rise = np.where(changes, np.clip(rise, -max_rise, max_rise), 0.0)
     farthest = min(int(TUNING.delay_s / step), len(even) - 1)
     lags = np.arange(-farthest, farthest + 1)
     size = next_fast_len(2 * len(even))

@@ -15,7 +15,7 @@ from palpate.recording.timed import implausible_unit, normal_force
 _AWAY: Final = 3.0
 """A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
 _TOUCHED: Final = 3.0
-"""Least force of a contact, in SD of the force."""
+"""Minimum force of a contact, in SD of the force."""
 _DISORDER: Final = 2.5
 """Way of a probe's rows, over its depth, that is not one press and its retreat."""
 _MANY: Final = 50
@@ -64,8 +64,8 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     given = readings.touch is not None
     light = [force[one][0] for one, s, at in zip(kept, inward, begin_at, strict=True) if s[0] - at < 0.1 * (s.max() - at)]
     if given and len(light) > 0.5 * len(kept):
-        zero, greatest = float(np.median(light)), float(np.median([force[one].max() for one in kept]))
-        if abs(zero) > _UNTARED * (greatest - zero):
+        zero, usual_peak = float(np.median(light)), float(np.median([force[one].max() for one in kept]))
+        if abs(zero) > _UNTARED * (usual_peak - zero):
             faults.append(Fault(FaultCode.ZERO, len(kept), len(rows), Remedy.CORRECTED, zero))
             force = force - zero
     loads = [(s[d], force[one][d]) for s, one in zip(inward, kept, strict=True) if (d := cutting.loading(s))]

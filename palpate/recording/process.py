@@ -16,7 +16,7 @@ from palpate_models.numerics.frames import Array
 
 _TOGETHER: Final = 200
 Correlation = Callable[[Array], Array]
-"""Of values at two places, by their distance over the length, any shape."""
+"""Correlation of values at two places, by their distance over the length, any shape."""
 
 
 def gaussian(distance: Array) -> Array:

@@ -29,20 +29,20 @@ class ReadingLimits(NamedTuple):
 
     frozen: int = 10
     """A value that repeats this much longer than usual is frozen."""
-    fewest: int = 5
-    """Least number of readings of a clipped or frozen stretch."""
+    min_readings: int = 5
+    """Minimum number of readings of a clipped or frozen stretch."""
     clipped: float = 0.2
-    """Least end of a sensor's range, as a share of the greatest force."""
+    """Minimum end of a sensor's range, as a share of the maximum force."""
     clipped_count: float = 3.0
     """A force at the end of the range is at least this many times as frequent as the next one."""
     missing: float = 3.0
     """Distance of a number for missing values from all others, over the size of these."""
     missing_count: int = 3
-    """Least number of times that it is there."""
+    """Minimum number of times that it is there."""
     missing_others: int = 10
-    """Least number of different other values: a raster of two lines has two."""
+    """Minimum number of different other values: a raster of two lines has two."""
     spike: float = 0.5
-    """Least size of a spike of the force, over the range of the force."""
+    """Minimum size of a spike of the force, over the range of the force."""
     gap_s: float = 600.0
     """Longest time between rows: longer ones are shortened to it."""
     resolution: float = 0.03
@@ -53,26 +53,26 @@ class ReadingLimits(NamedTuple):
     disagree: float = 0.35
     """Log ratio of forces at one place that is reported."""
     sure: float = 4.0
-    """Least depth, in SD of its zero; least force, in SD of its noise."""
+    """Minimum depth, in SD of its zero, and minimum force, in SD of its noise."""
     share: float = 0.3
-    """Least depth, as a share of the usual one."""
+    """Minimum depth, as a share of the usual one."""
     line: float = 0.1
-    """Least width of the places, over the radius of the footprint, from which on there is a map."""
+    """Minimum width of the places, over the radius of the footprint, from which on there is a map."""
     rows: int = 10
     risen: float = 0.5
     """Mean way of probes along their normals, over its size, from which the normals point inward."""
     upright: float = 0.7
     """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
     doubtful_frame_deg: float = 25.0
-    """Angle between force and motion from which it is reported."""
+    """Angle between force and motion from which the frame is reported as doubtful."""
     wrong_frame_deg: float = 40.0
-    """The same from which there is no map."""
+    """Angle between force and motion from which there is no map."""
     force_n: tuple[float, float] = (0.01, 200.0)
     """Change of the force in a recording."""
     young_pa: tuple[float, float] = (50.0, 3e6)
     """Modulus of the body."""
     usual_young_pa: tuple[float, float] = (5e3, 5e5)
-    """The same of most organs and phantoms."""
+    """Modulus of most organs and phantoms."""
     speed_mps: float = 1.0
     """Usual speed of the tool where it moves."""
     step_s: tuple[float, float] = (2e-5, 2.0)
@@ -122,8 +122,8 @@ def clean_readings(readings: Readings, radius: float) -> tuple[Readings, list[Fa
             faults.append(Fault(FaultCode.TWO_TOOLS, len(p), len(p), Remedy.REFUSED, usual))
         drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * usual), float(away.max(initial=0.0)))
         spike = np.abs(readings.force - median_filter(readings.force, (5, 1), mode="nearest")).max(axis=1)
-        most = LIMITS.spike * float(np.ptp(np.quantile(readings.force, (0.01, 0.99), axis=0), axis=0).max())
-        drop(FaultCode.SPIKE, spike > most, float(spike.max(initial=0.0)))
+        max_spike = LIMITS.spike * float(np.ptp(np.quantile(readings.force, (0.01, 0.99), axis=0), axis=0).max())
+        drop(FaultCode.SPIKE, spike > max_spike, float(spike.max(initial=0.0)))
     if (step := _resolution(readings.force)) > LIMITS.resolution * float(np.ptp(readings.force, axis=0).max(initial=0.0)):
         faults.append(Fault(FaultCode.RESOLUTION, 1, 1, Remedy.KEPT, step))
     clipped, limit = _find_clipped(readings.force, readings.position)
@@ -199,7 +199,7 @@ def _frozen(values: Array, others: Array) -> Mask:
     usual = float(np.median(lengths)) if lengths.sum() > 0.5 * len(values) else 1.0  # slower than the rows
     for one in runs:
         changes = (np.diff(others[one], axis=0) != 0).any(axis=1).mean()
-        frozen[one] = one.stop - one.start > max(LIMITS.frozen * usual, LIMITS.fewest) and changes > 0.5
+        frozen[one] = one.stop - one.start > max(LIMITS.frozen * usual, LIMITS.min_readings) and changes > 0.5
     return frozen
 
 
@@ -217,7 +217,7 @@ def _find_clipped(force: Array, position: Array) -> tuple[Mask, float]:
             if abs(value) < LIMITS.clipped * np.abs(force).max() or counts[end] < LIMITS.clipped_count * counts[following]:
                 continue
             runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == value)))
-            if any((~still[one]).sum() >= LIMITS.fewest for one in runs):
+            if any((~still[one]).sum() >= LIMITS.min_readings for one in runs):
                 clipped[column == value] = True
                 limit = abs(value)
     return clipped, limit
@@ -281,8 +281,8 @@ def select_usable(contacts: list[Contact], radius: float, undeep_ones: int, faul
     usual = float(np.median([contact.depth.max() for contact in contacts])) if contacts else 0.0
 
     def is_deep(contact: Contact) -> bool:
-        least = max(LIMITS.sure * contact.depth_uncertainty, LIMITS.share * usual)
-        return bool(contact.depth.max() > least and contact.force.max() > LIMITS.sure * contact.force_noise)
+        min_depth = max(LIMITS.sure * contact.depth_uncertainty, LIMITS.share * usual)
+        return bool(contact.depth.max() > min_depth and contact.force.max() > LIMITS.sure * contact.force_noise)
 
     deep_ones = [contact for contact in contacts if is_deep(contact)]
     shallow = undeep_ones + len(contacts) - len(deep_ones)
@@ -312,8 +312,8 @@ def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[in
     force = np.log(np.maximum(loads.force, 1e-9))
     wrong: set[int] = set()
     for k, near in enumerate(cKDTree(places).query_ball_point(places, 0.3 * np.sqrt(radius * depth))):
-        most = LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree
-        if len(near) > 1 and abs(force[k] - np.median(force[near])) > most:
+        limit = LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree
+        if len(near) > 1 and abs(force[k] - np.median(force[near])) > limit:
             wrong.add(still[k])
     return wrong
 

@@ -48,7 +48,7 @@ class Readings:
     """n readings of a tool, in the frame of the positions."""
 
     position: Array
-    """Of the tool [m], shape (n, 3): of the mapped point once `moved`."""
+    """Position of the tool [m], shape (n, 3): of the mapped point once `moved`."""
     force: Array
     """On the tool [N], shape (n, 3), or (n, 1) along the normal."""
     time: Array | None = None

@@ -25,9 +25,9 @@ class ContactKind(StrEnum):
     """Motions of the tool in contact."""
 
     PROBE = "probe"
-    """In and out at one place, without time."""
+    """Motion in and out at one place, without time."""
     PRESS = "press"
-    """In and out at one place, over time."""
+    """Motion in and out at one place, over time."""
     SLIDE = "slide"
     """Along the skin."""
 
@@ -145,7 +145,7 @@ class PalpationRecording:
 
     @cached_property
     def depth_m(self) -> float:
-        """Nominal depth: the median of the presses' greatest depth, of slides their usual one [m]."""
+        """Nominal depth: the median of the presses' maximum depth, of slides their usual one [m]."""
         return float(np.median([t.depth.max() if t.kind is not ContactKind.SLIDE else np.median(t.depth) for t in self.touches]))
 
     def samples(self, depth_m: float | None = None) -> list[ForceSample]:
@@ -193,9 +193,9 @@ def width(places: Array) -> float:
 
 def implied_young(touches: Sequence[Contact], radius: float) -> tuple[float, float]:
     """Return the plane-strain modulus of a half-space that needs the forces of contacts [Pa] (Hertz), and their force [N]."""
-    most = [np.quantile(np.maximum((touch.depth, touch.force), 1e-9), 0.95, axis=1) for touch in touches]
-    moduli = [0.75 * force / np.sqrt(radius * depth**3) for depth, force in most]
-    return float(np.median(moduli)), float(np.median([force for _, force in most]))
+    highest = [np.quantile(np.maximum((touch.depth, touch.force), 1e-9), 0.95, axis=1) for touch in touches]
+    moduli = [0.75 * force / np.sqrt(radius * depth**3) for depth, force in highest]
+    return float(np.median(moduli)), float(np.median([force for _, force in highest]))
 
 
 def _press_sample(touch: Contact, number: int, force: float, noise: float, depth: float) -> ForceSample:

@@ -25,9 +25,9 @@ _OUTLIERS: Final = 3
 """Times that points are given less weight, which are this many SD off the skin through the others:"""
 _STRANGE: Final = 4.0
 _NARROW: Final = 0.1
-"""Least RMS width of the points, over the shortest length of the skin, over which it has a slope."""
+"""Minimum RMS width of the points, over the shortest length of the skin, over which it has a slope."""
 _PLANE: Final = 4
-"""Least number of points that a plane is fitted to."""
+"""Minimum number of points that a plane is fitted to."""
 
 
 class RecordedSkin(NamedTuple):
@@ -84,24 +84,25 @@ def grid_over(xy: Array, margin: float) -> tuple[Array, Array]:
     return x, y
 
 
-def fit_skin(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> RecordedSkin:
+def fit_skin(points: Array, sd: Array, stations: tuple[Array, Array], shortest: float) -> RecordedSkin:
     """Return the skin through points [m], shape (n, 3), of standard deviation `sd` [m], shape (n,).
 
-    `least`: shortest length over which the skin varies [m].
+    `shortest`: shortest length over which the skin varies [m].
     """
     chosen = np.argsort(sd, kind="stable")[:: max(1, len(sd) // _MOST)]
     points, sd = points[chosen], sd[chosen]
     centre = points.mean(axis=0)
     terms = 3 if len(points) >= _PLANE else 1
     sloping = _terms(points, centre, terms) / sd[:, None]
-    plane = np.linalg.lstsq(sloping, (points[:, 2] - centre[2]) / sd, rcond=_NARROW * least)[0]  # a line shows no slope across it
+    # a line shows no slope across it
+    plane = np.linalg.lstsq(sloping, (points[:, 2] - centre[2]) / sd, rcond=_NARROW * shortest)[0]
     rest = points[:, 2] - centre[2] - _terms(points, centre, terms) @ plane
     size = max(float(np.sqrt(np.mean(rest**2))), float(np.median(sd)), 1e-6)
-    extent = float(np.ptp(points[:, :2], axis=0).max()) + least
-    begin = np.log((1.0, max(least, 0.5 * extent), 0.05))
+    extent = float(np.ptp(points[:, :2], axis=0).max()) + shortest
+    begin = np.log((1.0, max(shortest, 0.5 * extent), 0.05))
     process = PlaceProcess(points[:, :2], rest / size, (sd / size) ** 2, begin)
     with threadpool_limits(1):
-        process = process.fitted(((0.05, 1e3), (least, 10 * extent), (1e-4, 1.0)))
+        process = process.fitted(((0.05, 1e3), (shortest, 10 * extent), (1e-4, 1.0)))
         for _ in range(_OUTLIERS):
             precision = np.diag(cho_solve((process.cholesky, True), np.eye(len(points))))
             off = process.weights / precision  # of each point from the skin through the others

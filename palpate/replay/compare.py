@@ -93,7 +93,7 @@ class FieldDifference:
     recorded: str
     got: str
     deviation: float
-    """In the field's unit; infinite if strings, sizes or NaNs differ."""
+    """Deviation in the field's unit; infinite if strings, sizes or NaNs differ."""
     tolerance: float
 
     @property

@@ -89,7 +89,7 @@ _SAMPLE: Final = np.dtype([
 
 
 def peak_force(message: Any) -> float:
-    """Return the greatest contact force [N] since the previous `palpation_msgs/IndentationTruth`, including its current one."""
+    """Return the maximum contact force [N] since the previous `palpation_msgs/IndentationTruth`, including its current one."""
     return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
 
 

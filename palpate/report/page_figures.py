@@ -40,8 +40,8 @@ class FigureTuning(NamedTuple):
 
     free_mm: float = -20.0
     """Depth below which the tool is clear of the surface; not drawn."""
-    least_mm: float = -5.0
-    """Least depth in figures of the contact."""
+    min_depth_mm: float = -5.0
+    """Minimum depth in figures of the contact."""
     vertices: int = 65_535
     """The viewer's indices have 16 bits."""
     unknown_grey: float = 0.80
@@ -130,7 +130,7 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
     depth.plot(states.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
     depth.plot(states.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
-    depth.set_ylim(SHOWN.least_mm, None)
+    depth.set_ylim(SHOWN.min_depth_mm, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     force.set_xlim(states.time[0], states.time[-1])

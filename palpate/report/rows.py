@@ -24,7 +24,7 @@ class FindingRow(_Row):
     """A finding or a candidate of the examination."""
 
     centroid_m: Point
-    """In the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
+    """Centroid in the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
     quadrant: str
     area_m2: float
     """On the surface."""
@@ -71,7 +71,7 @@ class FindingScore:
     place_error_m: float | None
     """Distance of its centroid, at the place truly touched, from the lump's, in xy of A."""
     absolute_error_m: float | None
-    """The same in world, perpendicular to the outward direction: includes the errors of kinematics and registration."""
+    """Distance in world, perpendicular to the outward direction: includes the errors of kinematics and registration."""
     size_error: float | None
     """Its area divided by the lump's, minus one."""
     true_ratio: float | None
@@ -108,12 +108,12 @@ class Scores:
     coverage_90: float | None
     """Share of the scanned area on which the map's 90 % band includes the true apparent stiffness; None without a map."""
     coverage_90_in_lumps: float | None
-    """The same within the areas of lumps."""
+    """Coverage by the 90 % band within the areas of lumps."""
     findings: tuple[FindingScore, ...]
     on_structure: int = 0
     """Findings on structures of the wall, such as scars: neither matched nor false."""
     coverage_90_on_guarding: float | None = None
-    """The same on guarded muscle."""
+    """Coverage by the 90 % band on guarded muscle."""
     candidates: tuple[FindingScore, ...] = ()
     """Scores of candidates, which do not count in the fields above."""
 
@@ -122,12 +122,12 @@ class LumpRow(_Row):
     """Palpable truth of a lump."""
 
     centroid_m: Point
-    """Centre of its area, xy of the abdomen frame [m]; of a lump that is not palpable the place of its greatest effect."""
+    """Centre of its area, xy of the abdomen frame [m]; of a lump that is not palpable the place of its maximum effect."""
     quadrant: str
     area_m2: float
-    """Area where its effect is at least half of its greatest; 0 if it is not palpable."""
+    """Area where its effect is at least half of its maximum; 0 if it is not palpable."""
     felt_contrast: float
-    """Apparent stiffness with it divided by that without it, at the place of its greatest effect."""
+    """Apparent stiffness with it divided by that without it, at the place of its maximum effect."""
     palpable: bool
 
 
@@ -145,9 +145,9 @@ class DepthRow(_Row):
     true_against_setpoint_m: float | None
     """True depth against the set-point: regulation and perception together."""
     true_against_setpoint_beside_m: float | None
-    """Outside of lumps."""
+    """True depth against the set-point outside of lumps."""
     true_against_setpoint_lump_m: float | None
-    """In their areas."""
+    """True depth against the set-point in the areas of lumps."""
     measured_against_true_m: float | None
     """Measured against true depth: perception alone."""
     measured_against_true_beside_m: float | None
@@ -206,13 +206,13 @@ class Report(_Row):
     failure: str | None
     """Service and cause; null when the run completed."""
     failure_code: FailureCode | None = None
-    """The same for programs, such as `role_lost`."""
+    """Cause for programs, such as `role_lost`."""
     lost: dict[str, float]
     """Lost services, with the simulated time of their last message [s]."""
     samples: int
     skipped_targets: int
     max_force_N: float | None
-    """Greatest true contact force over all steps of the tissue; without a truth, greatest measured normal force."""
+    """Maximum true contact force over all steps of the tissue; without a truth, maximum measured normal force."""
     mean_force_N: float | None
     """Mean measured normal force in steady contact."""
     depth_rms_error_m: float | None
@@ -251,7 +251,7 @@ class Report(_Row):
 
 _SURE: Final = 0.99
 _REPORTED: Final = 0.05
-"""Least probability of something else than a lump that is reported."""
+"""Minimum probability of something else than a lump that is reported."""
 OTHERS: Final = {
     "guarding": "a tensed muscle",
     "ridge": "a scar or another ridge",

@@ -127,7 +127,7 @@ def _run(
 
 
 def _rate(scenario: Scenario) -> float:
-    """Return the rate of a wall-clock run: PALPATE_RATE, or the greatest that the self-test allows on this machine.
+    """Return the rate of a wall-clock run: PALPATE_RATE, or the highest that the self-test allows on this machine.
 
     Raises UserError if there is none.
     """

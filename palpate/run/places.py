@@ -27,7 +27,7 @@ from palpate_inputs import read_json
 from palpate_plugins import is_file
 
 FILE = "places.json"
-"""In the results folder of a run."""
+"""File in the results folder of a run."""
 
 
 class ServicePlace(NamedTuple):

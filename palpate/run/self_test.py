@@ -46,7 +46,7 @@ class TimingResult(NamedTuple):
 
     @property
     def rate(self) -> float | None:
-        """Return the greatest of `RATES` that the machine can keep, None if there is none."""
+        """Return the highest of `RATES` that the machine can keep, None if there is none."""
         possible = min(self.ticks, TEST.late_ms / max(self.late_ms, 1e-3))
         return next((rate for rate in RATES if rate <= possible), None)
 

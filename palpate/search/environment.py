@@ -9,7 +9,7 @@
 
 An episode is one patient and `presses` presses. The reward of a press is the decrease of the entropy of the posterior over
 "no lump, or one at this place" [nat], less `REWARD.per_s` per second. The last press adds the logarithm of the probability of the
-truth (no lump, or one near its true place), at least `REWARD.least`.
+truth (no lump, or one near its true place), at least `REWARD.minimum`.
 """
 
 from dataclasses import replace
@@ -34,7 +34,7 @@ class RewardTuning(NamedTuple):
     """Settings of the reward."""
 
     per_s: float = 0.01
-    least: float = -5.0
+    minimum: float = -5.0
     near_m: float = 0.020
     """A lump hypothesis within this distance of the true place counts as correct."""
 
@@ -96,7 +96,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._count += 1
         over = self._count == self._presses
         if over:
-            reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.least)
+            reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.minimum)
         info = {"lump": self.posterior.lump, "truth": self._truth()} if over else {}
         return self._observed(), float(reward), over, False, info
 

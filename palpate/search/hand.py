@@ -88,7 +88,7 @@ class PatientHand(_Timed):
         self._mean = self.patient.tissue.breathing.mean_m
 
     def press(self, xy: Array, depth: float) -> Press:
-        """As `Hand.press`."""
+        """Press; see `Hand.press`."""
         patient, loop = self.patient, self._loop
         idle = self._begin(xy, depth) - depth / HAND.descent_mps - HAND.hold_s
         patient.rest(max(idle, 0.0))
@@ -136,7 +136,7 @@ class SurrogateHand(_Timed):
         self._exponent = float(self._rng.normal(*_EXPONENT))
 
     def press(self, xy: Array, depth: float) -> Press:
-        """As `Hand.press`."""
+        """Press; see `Hand.press`."""
         loop, rng = self._loop, self._rng
         self._begin(xy, depth)
         time = loop.begin_s + self.spent

@@ -21,7 +21,7 @@ class TrialLump(NamedTuple):
     """Felt contrast of each lump, by the surrogate, at its centre."""
     radius_m: float = 0.020
     border_m: float = 0.030
-    """Least distance of a lump's centre from the region's edge."""
+    """Minimum distance of a lump's centre from the region's edge."""
     presses: int = 100
 
 

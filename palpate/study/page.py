@@ -24,7 +24,7 @@ from palpate.study.statistics.estimate import Estimate
 
 COLOURS: Final = ("#0f766e", "#c2410c", "#7c3aed", "#2563eb", "#be185d", "#854d0e")
 HUMAN: Final = "#b91c1c"
-MOST: Final = len(COLOURS)
+MAX_METHODS: Final = len(COLOURS)
 """Methods in one plot."""
 VARIABLES: Final = {INK: "--ink", QUIET: "--quiet", GRID: "--line", HUMAN: "--bad"} | {
     colour: f"--c{i}" for i, colour in enumerate(COLOURS)
@@ -100,8 +100,8 @@ def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: s
 
 
 def roc(methods: Sequence[MethodRow]) -> Markup | None:
-    """Return the ROC per patient of the first MOST methods; None if none has a curve."""
-    shown = [(a.name, a.roc) for a in methods[:MOST] if a.roc is not None]
+    """Return the ROC per patient of the first MAX_METHODS methods; None if none has a curve."""
+    shown = [(a.name, a.roc) for a in methods[:MAX_METHODS] if a.roc is not None]
     if not shown:
         return None
     figure, (axes,) = _figure(6.2, 5.2)
@@ -119,14 +119,14 @@ def roc(methods: Sequence[MethodRow]) -> Markup | None:
 
 
 def froc(methods: Sequence[MethodRow]) -> Markup | None:
-    """Return the FROC of the first MOST methods; None if none has a curve."""
-    shown = [(a.name, a.froc_curve) for a in methods[:MOST] if a.froc_curve is not None]
+    """Return the FROC of the first MAX_METHODS methods; None if none has a curve."""
+    shown = [(a.name, a.froc_curve) for a in methods[:MAX_METHODS] if a.froc_curve is not None]
     if not shown:
         return None
     figure, (axes,) = _figure(7.4, 5.2)
-    least = RATES[0] / 2
+    lowest = RATES[0] / 2
     for color, (name, curve) in zip(COLOURS, shown, strict=False):
-        x = np.maximum(curve.false_findings, least)
+        x = np.maximum(curve.false_findings, lowest)
         axes.plot(x, curve.sensitivity, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
         axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.13, lw=0)
         axes.plot(RATES, [e.value or 0.0 for e in curve.at.values()], "o", ms=4, color=color)
@@ -136,7 +136,7 @@ def froc(methods: Sequence[MethodRow]) -> Markup | None:
     axes.set_xticks(RATES, ["1/8", "1/4", "1/2", "1", "2", "4", "8"])
     axes.xaxis.set_minor_locator(NullLocator())
     _percent(axes)
-    axes.set_xlim(least, RATES[-1])
+    axes.set_xlim(lowest, RATES[-1])
     axes.set_ylim(0, 1.02)
     _legend(axes, "lower right")
     return _svg(figure)
@@ -222,7 +222,7 @@ def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
 
 
 def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> Markup | None:
-    """Return the reliability diagram of the first MOST methods; None without any."""
+    """Return the reliability diagram of the first MAX_METHODS methods; None without any."""
     if not rows:
         return None
     figure, (axes,) = _figure(6.2, 5.2)
@@ -254,7 +254,7 @@ def render(summary: Mapping[str, Any], methods: Sequence[MethodRow]) -> str:
     environment.filters |= {"figure": figure, "p": p_value, "words": lambda name: COVARIATES[name][0]}
     environment.filters["percent"] = partial(figure, scale=100.0, digits=1, unit=" %")
     environment.filters["mm"] = partial(figure, scale=1e3, digits=1, unit=" mm")
-    shown = methods[:MOST]
+    shown = methods[:MAX_METHODS]
     calibrated = [(a.name, a.calibration) for a in shown if a.calibration is not None]
     return environment.get_template("study.html.j2").render(
         s=summary,

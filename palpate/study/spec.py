@@ -34,7 +34,7 @@ Tier = Literal["whole", "quick"]
 Runtime = Literal["lockstep", "wallclock"]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 Range = tuple[float, float]
-"""Least and greatest value, which `Draw` checks."""
+"""Minimum and maximum, which `Draw` checks."""
 Settings = dict[str, Any]
 """Fields of a scenario by their path, such as `exam.depth_m: 0.008`."""
 
@@ -61,7 +61,7 @@ class Grid(Section):
 
 
 class Lumps(Section):
-    """Lumps that are drawn for each patient from their seed. Ranges are (least, greatest), as in `phantom.draw`."""
+    """Lumps that are drawn for each patient from their seed. Ranges are (minimum, maximum), as in `phantom.draw`."""
 
     count: Ends[Count] = (1, 1)
     """Number of lumps per patient."""

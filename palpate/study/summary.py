@@ -41,7 +41,7 @@ CASES: Final = _schema(
 )
 """One row per case. What is not known, as for a case without a report, is null.
 
-`score`: greatest confidence of any finding or candidate, 0 without one. `exam_time_s`: simulated time. `sim_time_s`: wall time of
+`score`: highest confidence of any finding or candidate, 0 without one. `exam_time_s`: simulated time. `sim_time_s`: wall time of
 the simulation, in whole examinations with the assessment. `assess_time_s`: wall time of the assessment (processor time in quick
 cases). `wall_time_s`: all wall time, including the truth. `core_s`: processor time. `loop_examinations`: number of whole
 examinations that the errors of a quick case were fitted to; null for a whole one."""
@@ -58,7 +58,7 @@ LUMPS: Final = _schema(
     "case_id", "lump", "felt_contrast felt_radius_m depth_m radius_m contrast confidence place_error_m", "palpable found"
 )
 """One row per lump, also of failed cases. `felt_radius_m`, `radius_m`: radius of the circle with the felt area and with the area
-of the outline. `found`: by a reported finding. `confidence`: greatest one of its findings and candidates, 0 without any."""
+of the outline. `found`: by a reported finding. `confidence`: highest one of its findings and candidates, 0 without any."""
 
 
 def write_tables(folder: Path, study: str, outcomes: Iterable[Outcome]) -> None:

@@ -1,7 +1,7 @@
 """Palpable properties of a pressed patient: apparent stiffness between the pressed places, and areas of lumps.
 
 The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected
-set about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane
+set about its maximum |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane
 of A; areas are on the skin.
 """
 
@@ -30,9 +30,9 @@ class Lump(NamedTuple):
 
     palpable: bool
     contrast: float
-    """Felt contrast where |e| is greatest [1]; below 1 if softer than its surroundings."""
+    """Felt contrast where |e| is maximal [1]; below 1 if softer than its surroundings."""
     centroid: Array
-    """Centre of its area [m], shape (2,); where |e| is greatest if it is not palpable."""
+    """Centre of its area [m], shape (2,); where |e| is maximal if it is not palpable."""
     area: float
     """[m^2]; 0 if it is not palpable."""
     inside: Mask
@@ -67,8 +67,8 @@ class Felt:
         """Mask of guarding: at least half of its maximum effect, shape (ny, nx)."""
         changed = np.abs(np.nan_to_num(between(np.log(pressed.force / pressed.plain))(self.raster)).reshape(xx.shape))
         parts, count = label(changed >= PALPABLE)
-        most = np.append(np.inf, maximum(changed, parts, np.arange(1, count + 1)))
-        self.structured: Mask = changed >= 0.5 * most[parts]
+        maxima = np.append(np.inf, maximum(changed, parts, np.arange(1, count + 1)))
+        self.structured: Mask = changed >= 0.5 * maxima[parts]
         """Mask of structures: at least half of the maximum effect of each connected one that is palpable, shape (ny, nx)."""
 
     def force(self, xy: Array) -> Array:
@@ -102,11 +102,11 @@ class Felt:
     def _lump(self, excess: LinearNDInterpolator) -> Lump:
         e = np.nan_to_num(excess(self.raster)).reshape(self._examined.shape)
         peak = int(np.argmax(np.abs(e) * self._examined))
-        greatest = float(e.ravel()[peak])
-        if abs(greatest) < PALPABLE:
-            return Lump(False, float(np.exp(greatest)), self.raster[peak], 0.0, np.zeros(e.shape, dtype=bool))
-        parts, _ = label(e * np.sign(greatest) >= 0.5 * abs(greatest))
+        extreme = float(e.ravel()[peak])
+        if abs(extreme) < PALPABLE:
+            return Lump(False, float(np.exp(extreme)), self.raster[peak], 0.0, np.zeros(e.shape, dtype=bool))
+        parts, _ = label(e * np.sign(extreme) >= 0.5 * abs(extreme))
         inside = parts == parts.ravel()[peak]
         weight = self.cells * inside.ravel()
         area = float(weight.sum())
-        return Lump(True, float(np.exp(greatest)), weight @ self.raster / area, area, inside)
+        return Lump(True, float(np.exp(extreme)), weight @ self.raster / area, area, inside)

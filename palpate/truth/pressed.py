@@ -121,9 +121,9 @@ class Pressed(NamedTuple):
     """Apparent stiffness of a patient by the standard press; p places, l lumps."""
 
     places: Array
-    """[m], on the skin at rest, shape (p, 3), in A."""
+    """Places [m], on the skin at rest, shape (p, 3), in A."""
     force: Array
-    """Of the patient as is [N], shape (p,)."""
+    """Force of the patient as is [N], shape (p,)."""
     limited: NDArray[np.bool_]
     """True where the press ended at its limit, shape (p,)."""
     healthy: Array

@@ -49,7 +49,7 @@ def fit(
         print_json(figures)
         return
     print(
-        f"{quality.held_out} of {quality.presses} places held out: force within {100 * quality.error:.1f} % RMS, at the greatest "
+        f"{quality.held_out} of {quality.presses} places held out: force within {100 * quality.error:.1f} % RMS, at the maximum "
         f"depth {100 * quality.error_at_depth:.1f} % (if uniform: {100 * quality.variation:.1f} %); {quality.lumps} lumps"
     )
     print(f"written to {out}: twin.yaml, twin.csv, twin.png, twin.json; next: palpate run {out / 'twin.yaml'}")

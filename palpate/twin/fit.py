@@ -51,14 +51,14 @@ class FitTuning(NamedTuple):
     surface_sd_m: float = 3e-4
     """SD of a point of the surface."""
     readings: int = 8
-    """Readings of a press at most."""
+    """Maximum number of readings of a press."""
     slide_steps: int = 4
     probe_step_s: float = 10.0
     """Time between the readings of a probe, whose time is unknown: nothing of the dashpot's force is left."""
-    least: int = 20
-    """Least number of presses."""
-    most: int = 800
-    """Presses that are fitted at most."""
+    min_presses: int = 20
+    """Minimum number of presses."""
+    max_presses: int = 800
+    """Maximum number of presses that are fitted."""
 
 
 TUNING: Final = FitTuning()
@@ -81,7 +81,7 @@ class FittedPress(NamedTuple):
 
     @property
     def deepest(self) -> int:
-        """Index of the last reading near the greatest depth."""
+        """Index of the last reading near the maximum depth."""
         return int(np.flatnonzero(self.depth >= 0.95 * self.depth.max())[-1])
 
     @property
@@ -91,16 +91,16 @@ class FittedPress(NamedTuple):
 
 
 def presses_of(recording: PalpationRecording) -> list[FittedPress]:
-    """Return the presses of a recording, thinned evenly to the most that are fitted. Raises UserError if there are too few."""
+    """Return the presses of a recording, thinned evenly to `TUNING.max_presses`. Raises UserError if there are too few."""
     slides = {n for n, touch in enumerate(recording.touches, start=1) if touch.kind is ContactKind.SLIDE}
     presses = [_pressed(touch) for touch in recording.touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0]
     if slides:
         radius = recording.indenter_radius_m
         presses += [_slid(sample, radius) for sample in recording.samples() if sample.stroke in slides and sample.depth > 0]
     presses = [press for press in presses if press.felt > 0]
-    if len(presses) < TUNING.least:
-        raise UserError(f"{recording.name}: {len(presses)} presses with a force, at least {TUNING.least} are needed for a twin")
-    chosen = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), TUNING.most)).round().astype(int))
+    if len(presses) < TUNING.min_presses:
+        raise UserError(f"{recording.name}: {len(presses)} presses with a force; a twin needs at least {TUNING.min_presses}")
+    chosen = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), TUNING.max_presses)).round().astype(int))
     return [presses[k] for k in chosen]
 
 

@@ -34,12 +34,12 @@ class TwinTuning(NamedTuple):
     """Presses from which the scale of Young's modulus is found."""
     steps: int = 8
     """Time steps of such a press: it goes down during the first half."""
-    least_radius_m: float = 0.002
-    """Least radius of a lump."""
+    min_radius_m: float = 0.002
+    """Minimum radius of a lump."""
     ring: float = 2.0
     """The surroundings of a finding reach this many of its radii."""
-    least: float = 1.05
-    """Least change of the modulus, up or down."""
+    min_contrast: float = 1.05
+    """Minimum change of the modulus, up or down."""
 
 
 TUNING: Final = TwinTuning()
@@ -53,9 +53,9 @@ class Quality(NamedTuple):
     error: float
     """RMS of the differences at the held-out places over the RMS of their forces, all readings."""
     error_at_depth: float
-    """The same of the greatest depth only."""
+    """RMS of the differences at the maximum depth, over the RMS of their forces."""
     variation: float
-    """SD over mean of the recorded forces at the greatest depth: the error of a twin that is the same everywhere."""
+    """SD over mean of the recorded forces at the maximum depth: the error of a twin that is the same everywhere."""
     onset_m: float
     lumps: int
     origin_m: tuple[float, float, float]
@@ -104,14 +104,14 @@ def _lumps(vertices: Array, finding: NDArray[np.int32], wall: FittedWall) -> lis
         if not len(inside):
             continue
         x, y = inside.mean(axis=0).tolist()
-        a, b = np.maximum(2 * inside.std(axis=0), TUNING.least_radius_m).tolist()  # of a uniform ellipse
+        a, b = np.maximum(2 * inside.std(axis=0), TUNING.min_radius_m).tolist()  # of a uniform ellipse
         away = np.linalg.norm((nodes - (x, y)) / (a, b), axis=1)
         k_w = wall.grid.k_w_n_per_m3
         ring = (away > 1) & (away <= TUNING.ring)
         if not ring.any():
             continue
         contrast = float(np.clip(np.median(k_w[away <= 1]) / np.median(k_w[ring]), 0.1, 20))
-        if max(contrast, 1 / contrast) >= TUNING.least:
+        if max(contrast, 1 / contrast) >= TUNING.min_contrast:
             lumps.append(Lesion(centre_m=(x, y), radii_m=(a, b), contrast=contrast, edge_m=min(0.008, a, b)))
     return lumps
 
@@ -147,7 +147,7 @@ def _scenario(
 
 
 def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array, Array]:
-    """Return recorded forces at the greatest depth of some presses, and those of the elastic tier [N], shapes (n,)."""
+    """Return recorded forces at the maximum depth of some presses, and those of the elastic tier [N], shapes (n,)."""
     service = elastic_service(scenario)
     assert isinstance(service, TissueService)
     fitted = np.flatnonzero(~wall.held_out)
@@ -201,7 +201,7 @@ def _draw(path: Path, places: Array, felt: Array, expected: Array, held_out: NDA
     low, high = np.quantile(felt, (0.01, 0.99))
     for axes, force, title in ((maps[0], felt, "recorded"), (maps[1], expected, "twin")):
         dots = axes.scatter(*(1e3 * places[:, :2].T), c=force, s=14, vmin=low, vmax=high)
-        axes.set(title=f"{title}: force at the greatest depth [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+        axes.set(title=f"{title}: force at the maximum depth [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
         figure.colorbar(dots, ax=axes, shrink=0.8)
     for chosen, label in ((~held_out, "fitted"), (held_out, "held out")):
         maps[2].plot(felt[chosen], expected[chosen], ".", label=label)

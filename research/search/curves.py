@@ -1,6 +1,6 @@
 """Results of the study of searches: `python -m research.search.curves out/search-study` prints the table and draws the curves.
 
-The threshold of each policy is the SPECIFICITY quantile, over healthy tuning patients, of the greatest probability within the
+The threshold of each policy is the SPECIFICITY quantile, over healthy tuning patients, of the highest probability within the
 budget. A lump is found at the press after which it is first said to be near a place within NEAR_M of where it is; one that is
 first said to be elsewhere, or never, counts as the whole budget. Intervals: Wilson's for shares, percentiles of 2,000 bootstrap
 samples of patients for all else.
@@ -27,8 +27,8 @@ _BOOTSTRAPS: Final = 2000
 def thresholds(trials: pd.DataFrame) -> pd.Series:
     """Return the threshold of each policy."""
     healthy = trials[(trials.seed < TUNE_SEEDS) & trials.apart_m.isna()]
-    greatest = healthy.groupby(["policy", "seed"]).near.max()
-    return greatest.groupby("policy").quantile(SPECIFICITY, interpolation="higher")
+    highest = healthy.groupby(["policy", "seed"]).near.max()
+    return highest.groupby("policy").quantile(SPECIFICITY, interpolation="higher")
 
 
 def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:

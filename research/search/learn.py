@@ -32,7 +32,7 @@ class Training:
     """Extent of the training."""
 
     presses: int = 40
-    """Of an episode."""
+    """Presses of an episode."""
     patients: int = 100
     """Tuning patients that are met: seeds from 0 on."""
     environments: int = 8
@@ -76,7 +76,7 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
         return observed["maps"], given
 
     def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Return a press of the usual depth at a place, or of the greatest."""
+        """Return a press of the usual depth at a place, or of the maximum depth."""
         depth, row, column = np.unravel_index(int(action), (2, *self._shape[1:]))
         share = 2.0 * np.array((row / (self._shape[1] - 1), column / (self._shape[2] - 1))) - 1.0
         task = self._env.task
@@ -119,7 +119,7 @@ class Network(nn.Module):
         return scores
 
     def forward_critic(self, maps: torch.Tensor) -> torch.Tensor:
-        """Mean and greatest value of each channel, shape (n, 2 `TRAINING.width`)."""
+        """Mean and maximum of each channel, shape (n, 2 `TRAINING.width`)."""
         seen = self.hidden(maps).flatten(2)
         return torch.cat((seen.mean(dim=2), seen.amax(dim=2)), dim=1)
 
@@ -166,7 +166,7 @@ class LearningCurve(BaseCallback):
 
 
 def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], float]:
-    """Of the teacher with each patient: maps (n, layers, nx, ny), its actions (n,), rewards (n,), mean reward."""
+    """Return what the teacher does with each patient: maps (n, layers, nx, ny), its actions (n,), rewards (n,), mean reward."""
     env = Presses(SearchEnv(presses=TRAINING.presses, patients=TRAINING.patients, maps=True))
     seen: list[NDArray[np.float32]] = []
     chosen: list[int] = []
@@ -191,7 +191,7 @@ def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.i
 
 
 def turned(maps: NDArray[np.float32], action: NDArray[np.int64], how: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The same of a mirrored or transposed patient, one of 8 ways: no direction differs from another in a square region."""
+    """Return maps and action of the patient mirrored or transposed in one of 8 ways, which are alike in a square region."""
     n, _, nx, ny = maps.shape
     place = np.zeros((n, 2 * nx * ny), dtype=bool)
     place[np.arange(n), action] = True

@@ -33,7 +33,7 @@ _START: Final = (0.03, 0.06, 0.1, 0.1, 0.1, 0.05, 0.3, 0.4, 0.8, 0.3)
 
 
 def felt(seed: int, presses: int) -> tuple[Array, Array, Array]:
-    """Of a patient: log-forces of presses, shape (n,); covariance of each part, (k, n, n); that of the noise, (n, n)."""
+    """Return of a patient: log-forces of presses, shape (n,); covariance of each part, (k, n, n); that of the noise, (n, n)."""
     patient = case(seed)
     posterior = Posterior(SurrogateHand(patient.scenario, felt=patient.felt).task)
     search(SurrogateHand(patient.scenario, felt=patient.felt), policy("random"), presses, posterior)

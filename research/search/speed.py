@@ -9,7 +9,7 @@ import typer
 from palpate.search.environment import SearchEnv
 
 PRESSES: Final = 40
-"""Of an episode."""
+"""Presses of an episode."""
 _KINDS: Final[tuple[tuple[Literal["surrogate", "patient"], bool, int], ...]] = (
     ("surrogate", False, 20),
     ("surrogate", True, 20),
@@ -33,7 +33,7 @@ def rate(env: SearchEnv, episodes: int) -> float:
 
 
 def main(
-    rounds: Annotated[int, typer.Option(min=1, help="The median is reported, with the least and the greatest.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="The median is reported, with the minimum and the maximum.")] = 5,
 ) -> None:
     """Measure how fast an agent can learn, by each hand."""
     for hand, maps, episodes in _KINDS:

@@ -55,9 +55,9 @@ def summary(rows: pd.DataFrame) -> Iterator[str]:
         ill, healthy = mine[mine.lump], mine[~mine.lump]
         presses: Array = np.where(ill.found, ill.presses, TRIAL.presses).astype(float)
         if len(ill):
-            middle, most = (in_words(presses, quantile, rng) for quantile in (0.5, 0.9))
+            middle, ninety = (in_words(presses, quantile, rng) for quantile in (0.5, 0.9))
             found, false = share(int(ill.found.sum()), len(ill)), share(int((ill.false_findings > 0).sum()), len(ill))
-            yield f"{name}, with a lump: found {found}; with a false finding {false}; presses {middle}, 90 % {most}"
+            yield f"{name}, with a lump: found {found}; with a false finding {false}; presses {middle}, 90 % {ninety}"
             yield f"    seconds {in_words(ill.seconds.to_numpy(), 0.5, rng)}, off {1e3 * ill.place_error_m.median():.1f} mm"
         if len(healthy):
             quiet = share(int((healthy.false_findings == 0).sum()), len(healthy))

@@ -33,7 +33,7 @@ def pressed() -> pd.DataFrame:
 
 
 def probed(table: pd.DataFrame) -> pd.DataFrame:
-    """The same as a table of probes: ten steps of each, without time and without a zero of the force."""
+    """Return the table as probes: ten steps of each, without time and without a zero of the force."""
     rows = []
     for number, press in table.groupby("press"):
         down = press.iloc[: int(press.z.argmin()) + 1]

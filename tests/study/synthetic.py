@@ -27,7 +27,7 @@ def study(**changes: Any) -> Study:
 
 
 SLOPES = {"felt_contrast": 4.0, "felt_radius_m": 300.0, "depth_m": -60.0}
-"""Of the log odds of detection against the logarithm of felt contrast, felt radius [1/m] and depth [1/m]."""
+"""Slopes of the log odds of detection against the logarithm of felt contrast, felt radius [1/m] and depth [1/m]."""
 AT = {"felt_contrast": 1.4, "felt_radius_m": 0.012, "depth_m": 0.010}
 """A lump that is found with probability 1/2, without lapses."""
 

@@ -1,4 +1,4 @@
-"""The same study in every way to run it: workers come and go, runs are stopped, and the digest is the same.
+"""One study in every way to run it: workers come and go, runs are stopped, and the digest is the same.
 
 Cases are examined for real, by the quick tier.
 """

@@ -11,9 +11,9 @@ from math import prod
 from typing import Any, NamedTuple
 
 LESIONS = 8
-"""Most lesions that an FMU can have."""
+"""Maximum number of lesions of an FMU."""
 BRANCHES = 4
-"""Most Prony branches."""
+"""Maximum number of Prony branches."""
 
 
 class VariableKind(StrEnum):

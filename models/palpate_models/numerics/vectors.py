@@ -70,11 +70,11 @@ def nearest_vertex(p: Array, vertices: Array) -> tuple[float, int]:
 
     Linear search: for one point and some thousand vertices five times as fast as a call of scipy's tree.
     """
-    least, best = np.inf, 0
+    nearest, best = np.inf, 0
     x, y, z = p[0], p[1], p[2]
     for i in range(vertices.shape[0]):
         dx, dy, dz = vertices[i, 0] - x, vertices[i, 1] - y, vertices[i, 2] - z
         square = dx * dx + dy * dy + dz * dz
-        if square < least:
-            least, best = square, i
-    return sqrt(least), best
+        if square < nearest:
+            nearest, best = square, i
+    return sqrt(nearest), best

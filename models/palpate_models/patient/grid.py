@@ -22,8 +22,8 @@ class GridTuning(NamedTuple):
 
     apron_m: float = 0.12
     """Continuation of a body around its grid: the camera follows the wall next to the arm."""
-    least_nodes: int = 4
-    """Least number of nodes along an axis."""
+    min_nodes: int = 4
+    """Minimum number of nodes along an axis."""
     pitch_tolerance: float = 0.01
     """Largest deviation of a node from its place, over the pitch."""
 
@@ -106,9 +106,9 @@ def read_grid(path: Path) -> BodyGrid:
     axes = [np.unique(table[name]) for name in ("x_m", "y_m")]
     for name, axis in zip(("x_m", "y_m"), axes, strict=True):
         steps = np.diff(axis)
-        if len(axis) < GRID.least_nodes or np.ptp(steps) > GRID.pitch_tolerance * steps.mean():
+        if len(axis) < GRID.min_nodes or np.ptp(steps) > GRID.pitch_tolerance * steps.mean():
             raise GridError(
-                f"phantom.grid = {path}: {name} has {len(axis)} values; want {GRID.least_nodes} or more at equal distances"
+                f"phantom.grid = {path}: {name} has {len(axis)} values; want {GRID.min_nodes} or more at equal distances"
             )
     table = table[np.lexsort((table["y_m"], table["x_m"]))]
     if len(np.unique(table[["x_m", "y_m"]])) != len(table) or len(table) != len(axes[0]) * len(axes[1]):

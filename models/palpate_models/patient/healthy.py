@@ -22,13 +22,13 @@ class VariationTuning(NamedTuple):
 
     features: int = 96
     components: int = 2
-    most_anisotropic: float = 3.0
+    max_anisotropy: float = 3.0
     """Largest ratio of the lengths along and across a component's direction [A]."""
-    most_sd: float = 3.0
+    max_sd: float = 3.0
     """Bound of a field in standard deviations: healthy tissue has no extreme places."""
     muscle_edge_m: float = 0.010
     """Width of the transition between bands [A]."""
-    least_random: float = 0.3
+    min_random_share: float = 0.3
     """Minimum share of the random variation next to muscles."""
     coarse_m: float = 0.02
     belly_half_m: float = 0.10
@@ -93,7 +93,7 @@ def _component(rng: np.random.Generator, length_m: tuple[float, float], share: f
     """Draw a component with this share of the field's variance: family, lengths and direction."""
     family = _FAMILIES[int(rng.integers(len(_FAMILIES)))]
     length = np.exp(rng.uniform(*np.log(length_m)))
-    longer = np.exp(rng.uniform(0, np.log(VARIATION.most_anisotropic)))
+    longer = np.exp(rng.uniform(0, np.log(VARIATION.max_anisotropy)))
     lengths = np.array((min(length * longer, length_m[1]), length, length))
     part = _Component(_waves(rng, lengths, heavy=family is _FAMILIES[-1]), family, float(np.sqrt(share)))
     values = part(reference)
@@ -108,7 +108,7 @@ class NaturalField:
         shares = rng.dirichlet(np.ones(VARIATION.components))
         self._parts = [_component(rng, length_m, float(share), reference) for share in shares]
         total = self._sum(reference)
-        self._middle, self._reach = float(total.mean()), VARIATION.most_sd * float(total.std())
+        self._middle, self._reach = float(total.mean()), VARIATION.max_sd * float(total.std())
         bounded = self._bounded(reference)
         self._mean, self._sd = float(bounded.mean()), float(bounded.std())
 
@@ -165,7 +165,7 @@ def healthy_wall(
     rng = generator(seed, "variation")
     level, other = (NaturalField(rng, variation.length_m, reference) for _ in range(2))
     at_belly = np.log(muscle_factor(reference[:, 0], reference[:, 1], anatomy.muscles))
-    random = np.sqrt(max(variation.stiffness**2 - at_belly.var(), (VARIATION.least_random * variation.stiffness) ** 2))
+    random = np.sqrt(max(variation.stiffness**2 - at_belly.var(), (VARIATION.min_random_share * variation.stiffness) ** 2))
     x, y = points[:, 0], points[:, 1]
     log_level = np.log(muscle_factor(x, y, anatomy.muscles)) - at_belly.mean() + random * level(points)
     total = np.sqrt(random**2 + at_belly.var())

@@ -17,7 +17,7 @@ class MeshLimits(NamedTuple):
 
     largest_m: float = 3.0
     smallest_m: float = 0.05
-    most_vertices: int = 20_000
+    max_vertices: int = 20_000
     region_half_m: float = 0.112
     """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
     near_umbilicus_m: float = 0.03
@@ -25,7 +25,7 @@ class MeshLimits(NamedTuple):
     widest_m: float = 0.9
     """Width of the body across the umbilicus, and its thickness there."""
     thickest_m: float = 0.5
-    least_normal_z: float = 0.7
+    min_normal_z: float = 0.7
 
 
 LIMITS: Final = MeshLimits()
@@ -54,9 +54,9 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
         triangles = orient(vertices, triangles)
         check_place(vertices, triangles)
         surface = refine(vertices, triangles, edge_m)
-        if len(surface.vertices) > LIMITS.most_vertices:
+        if len(surface.vertices) > LIMITS.max_vertices:
             raise MeshError(
-                f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {LIMITS.most_vertices} are "
+                f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {LIMITS.max_vertices} are "
                 "simulated: decimate the mesh or raise phantom.edge_m"
             )
     except MeshError as error:
@@ -151,7 +151,7 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
     border = boundary_vertices(len(vertices), triangles)
-    if normal[2] < LIMITS.least_normal_z:
+    if normal[2] < LIMITS.min_normal_z:
         raise MeshError(f"at the umbilicus the surface faces ({', '.join(f'{x:.2g}' for x in normal)}), want +z ({frame})")
     if border.any() and vertices[border, 2].mean() > LIMITS.near_umbilicus_m:
         rise = vertices[border, 2].mean()
@@ -201,7 +201,7 @@ def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
         wanted = np.zeros(len(pairs), dtype=np.bool_)
         wanted[of_face[near]] = True
         split = wanted & (length > edge_m)
-        if not split.any() or len(vertices) > LIMITS.most_vertices:
+        if not split.any() or len(vertices) > LIMITS.max_vertices:
             break
         # Split only the longest edges of a neighbourhood at a time: bisection of longest edges keeps angles sound.
         longest_of_face = length[of_face].max(axis=1)

@@ -78,13 +78,13 @@ def _log_uniform(limits: tuple[float, float], rng: np.random.Generator) -> float
 
 def _separate_lump(draw: schema.Draw, rng: np.random.Generator, others: list[schema.Lesion]) -> schema.Lesion:
     """Return a lump that overlaps no other; if no try succeeds, the one farthest from the others."""
-    best, most = _lump(draw, rng, _place(draw, rng)), -np.inf
+    best, best_gap = _lump(draw, rng, _place(draw, rng)), -np.inf
     for _ in range(PEOPLE.tries):
         lump = best.model_copy(update={"centre_m": _place(draw, rng)})
         gaps = (dist(lump.centre_m, other.centre_m) - max(lump.radii_m) - max(other.radii_m) for other in others)
         gap = min(gaps, default=np.inf)
-        if gap > most:
-            best, most = lump, gap
+        if gap > best_gap:
+            best, best_gap = lump, gap
         if gap > 0:
             break
     return best

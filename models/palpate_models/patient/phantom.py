@@ -40,11 +40,14 @@ class PhantomModel:
     areas: Array
     """Area that belongs to each vertex [m^2], shape (n,)."""
     laplacian: sparse.csr_array
-    """Cotangent Laplacian [1] of the intrinsic Delaunay triangulation, shape (n, n): every edge weight is >= 0."""
+    """Cotangent Laplacian [1] of the intrinsic Delaunay triangulation, shape (n, n), integrated: L u = -A nabla^2 u.
+
+    Positive semidefinite: off-diagonal elements are <= 0.
+    """
     stiffness: Array
     """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
     background: Array
-    """The same without lesions, shape (n,); structures are part of it."""
+    """Modulus k_w without lesions but with structures [N/m^3], shape (n,)."""
     stiffening: Array
     """Stiffening with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
     tension: Array
@@ -133,7 +136,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
 
 
 def _breathing_profile(vertices: Array, normals: Array, fixed: NDArray[np.bool_]) -> Array:
-    """Share of the excursion, shape (n,): greatest about the umbilicus, none at the ends, the flanks and the back."""
+    """Share of the excursion, shape (n,): largest about the umbilicus, none at the ends, the flanks and the back."""
     y = vertices[:, 1]
     along = np.cos(np.where(y > 0, y / y.max(), y / y.min()) * np.pi / 2) ** 2
     profile = along * np.clip(normals[:, 2], 0, 1) ** 2

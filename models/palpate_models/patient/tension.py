@@ -47,10 +47,10 @@ def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, fr
 def tension_of_ratio(ratio: float, stiffness: Stiffness) -> float:
     """Return the tension relative to k_w [1] at which the force of the defining press is `ratio` times the relaxed one."""
     relaxed = pressed_force(stiffness, 0.0)
-    most = 2.0
-    while pressed_force(stiffness, most) < ratio * relaxed:
-        most *= 2
-    return float(brentq(lambda tension: pressed_force(stiffness, tension) - ratio * relaxed, 0.0, most, rtol=1e-6))
+    bound = 2.0
+    while pressed_force(stiffness, bound) < ratio * relaxed:
+        bound *= 2
+    return float(brentq(lambda tension: pressed_force(stiffness, tension) - ratio * relaxed, 0.0, bound, rtol=1e-6))
 
 
 def pressed_force(stiffness: Stiffness, tension: float, depth_m: float = DEPTH_M) -> float:

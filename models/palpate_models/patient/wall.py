@@ -55,7 +55,7 @@ def stored(u: Array, stiffening: Array) -> Array:
 
 
 def largest_slope(stiffening: Array, tension: Array) -> Array:
-    """Return the most that both springs can add to the modulus, over k_w [1]: what a step must be stable for."""
+    """Return the maximum that both springs can add to the modulus, over k_w [1]: what a step must be stable for."""
     return np.where(stiffening > 0, MOST_STIFFENING, 0.0) + tension
 
 

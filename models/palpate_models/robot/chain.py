@@ -69,7 +69,7 @@ class Arm:
     home_rad: Array
     """Ready posture: folded back over the base, tool straight down, out of the camera's view, shape (n,)."""
     inertias: tuple[Inertia, ...]
-    """Of the base and the link behind each joint: n + 1."""
+    """Inertias of the base and of the link behind each joint: n + 1."""
     capsules: tuple[tuple[Capsule, ...], ...]
     """Shape of the same links."""
     seeds_rad: tuple[tuple[float, ...], ...] = ()

@@ -17,13 +17,13 @@ class HomeTuning(NamedTuple):
     forward: float = 0.4
     """Place of the flange at home in front of the base, over the length of the arm."""
     height: float = 0.35
-    """The same above the base."""
+    """Height of the flange at home above the base, over the length of the arm."""
     bend: float = 0.02
     """Weight of the joints' angles at home."""
     spread: float = 0.003
-    """Of postures whose cost is that much above the best, the one with the highest elbow is taken."""
+    """Highest cost above the best one at which a posture is considered; of these, the one with the highest elbow is taken."""
     upright: float = 0.999
-    """Least cosine between the flange's z axis and straight down at home."""
+    """Minimum cosine between the flange's z axis and straight down at home."""
 
 
 HOME: Final = HomeTuning()
@@ -44,8 +44,8 @@ def ready_posture(arm: Arm) -> Array | None:
     margin = 0.1 * half
     bounds = (np.maximum(arm.lower_rad, near - np.pi) + margin, np.minimum(arm.upper_rad, near + np.pi) - margin)
     found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds) for start in starts]
-    least = min(float(one.cost) for one in found)
-    good = [one.x for one in found if one.cost < least + HOME.spread and arm.posture(one.x)[1][2] < -HOME.upright]
+    lowest = min(float(one.cost) for one in found)
+    good = [one.x for one in found if one.cost < lowest + HOME.spread and arm.posture(one.x)[1][2] < -HOME.upright]
     highest = max(good, key=lambda q: float(arm.posture(q)[0][arm.elbow[0], 2]), default=None)
     return None if highest is None else np.round(highest, 3)
 

@@ -43,7 +43,7 @@ class FeltSoFar:
     depth_uncertainty: Array
     """One sigma of the depth [m]."""
     exponent: Array
-    """Of the descent to a held press; 0 for other samples."""
+    """Force exponent of the descent to a held press [1]; 0 for other samples."""
 
 
 @dataclass(frozen=True)

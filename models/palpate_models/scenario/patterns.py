@@ -17,12 +17,12 @@ Surface = Callable[[Array], tuple[Array, Array]]
 class PatternLimits(NamedTuple):
     """Targets that a pattern may give, and the first touches."""
 
-    most_targets: int = 20_000
+    max_targets: int = 20_000
     """Maximum number of targets, which already take hours."""
     outside_m: float = 0.001
     """Tolerance of targets outside of the examined region."""
     apart_m: float = 1e-4
-    """Least distance of consecutive targets of a stroke."""
+    """Minimum distance of consecutive targets of a stroke."""
     touches_m: float = 0.07
     """Maximum spacing of the first touches, which determine offset, tilt and field of the surface correction."""
 
@@ -64,8 +64,8 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
         if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():
             raise PluginError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
     count = sum(map(len, lines))
-    if not 0 < count <= LIMITS.most_targets:
-        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LIMITS.most_targets}")
+    if not 0 < count <= LIMITS.max_targets:
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LIMITS.max_targets}")
     scan = Scan(lines, made.joined)
     off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
     if off.max() > LIMITS.outside_m:

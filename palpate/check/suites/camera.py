@@ -108,5 +108,5 @@ def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> 
     hit = X_WC[:3, 3] + rays * expected[..., None]
     on = (np.abs(hit - centre)[..., :2] < 0.8 * PLANE.half_m).all(axis=-1) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
-    most = error.size > 0.5 * max(int(on.sum()), 1)
-    rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, 0.01, "mm off", 1e3)
+    enough = error.size > 0.5 * max(int(on.sum()), 1)
+    rig.below("a level plane is where it is", abs(np.median(error)) if enough else np.inf, 0.01, "mm off", 1e3)

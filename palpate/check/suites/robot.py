@@ -23,7 +23,7 @@ class RobotTouches(NamedTuple):
     push_fraction: float = 0.02
     """Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
     push_rad: float = 0.01
-    """The same for an arm that takes positions."""
+    """Position step [rad] for an arm that takes positions."""
     moved_rad: float = 2e-4
     drift_rad: float = 0.05
     press_n: float = 10.0

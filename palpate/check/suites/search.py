@@ -12,7 +12,7 @@ from palpate_bus.messages.stamps import header
 
 REQUEST: Final = "exam/request"
 PRESS_S: Final = 0.3
-MOST: Final = 40
+MAX_PRESSES: Final = 40
 
 
 class SoftBelly(NamedTuple):
@@ -52,7 +52,7 @@ def suite(rig: Rig) -> None:
     rig.run(0.5, {"exam/state": play.state})
     rig.equal("requests once and waits", len(rig.log[REQUEST]), 1)
     early = 0
-    while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MOST:
+    while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MAX_PRESSES:
         asked = rig.last(REQUEST)
         if asked.number <= play.over:
             break

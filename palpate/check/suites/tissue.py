@@ -127,7 +127,7 @@ def _check_free(rig: Rig, received: list[ReceivedMessage], name: str) -> None:
 
 def _check_press(rig: Rig, received: list[ReceivedMessage], n_W: Array) -> None:
     normal = np.array([force(item) @ n_W for item in received])
-    got = f"{normal[-1]:.2f} N at {PRESS.depth_m * 1e3:.0f} mm, least {normal.min():.3f} N"
+    got = f"{normal[-1]:.2f} N at {PRESS.depth_m * 1e3:.0f} mm, minimum {normal.min():.3f} N"
     outward = normal[-1] > 0.05 and normal.min() > -1e-6
     rig.expect("a pressed surface pushes back, outward", outward, "a positive force along the normal", got)
     tenths = normal[normal > 0][:: max(1, int((normal > 0).sum()) // 10)]

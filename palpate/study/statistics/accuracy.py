@@ -34,7 +34,7 @@ class Sample(NamedTuple):
         return bootstrap.ratio(*(bootstrap.sums(each, self.patient) for each in (self.values, np.ones(len(self.values)))))
 
     def quantile(self, q: float, bootstrap: Bootstrap) -> Estimate:
-        """Return the quantile `q`: the least value that is not below this share of the values."""
+        """Return the quantile `q`: the lowest value that is not below this share of the values."""
         if not len(self.values):
             return Estimate(value=None, n=0, of=self.of)
         value = float(np.quantile(self.values, q, method="inverted_cdf"))
@@ -154,7 +154,7 @@ def of_cases(variant: Variant, column: str) -> Sample:
 
 
 BINS: Final = 10
-LEAST: Final = 1e-6
+MIN_PROBABILITY: Final = 1e-6
 """Confidences are clipped to this distance from 0 and 1 before their log odds are taken."""
 
 
@@ -228,8 +228,8 @@ def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
 
 def _slope(p: Array, hit: NDArray[np.bool_], drawn: Array) -> tuple[float, Array]:
     """Return the slope and its replicates; NaN if all or none hit or all confidences are equal."""
-    x = logit(np.clip(p, LEAST, 1 - LEAST))
-    if hit.all() or not hit.any() or np.ptp(x) < LEAST:
+    x = logit(np.clip(p, MIN_PROBABILITY, 1 - MIN_PROBABILITY))
+    if hit.all() or not hit.any() or np.ptp(x) < MIN_PROBABILITY:
         return float("nan"), np.full(len(drawn), np.nan)
     scale = x.std()
     z = np.column_stack((np.ones(len(x)), (x - x.mean()) / scale))

@@ -27,12 +27,12 @@ LOGARITHMIC: Final = ("felt_contrast", "contrast")
 class DetectabilityTuning(NamedTuple):
     """Settings of the fit."""
 
-    greatest_lapse: float = 0.25
+    max_lapse: float = 0.25
     prior_sd: float = 10.0
     """Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all,
     the likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
-    fewest: int = 10
-    """Least numbers of found and of missed lumps for a fit."""
+    min_lumps: int = 10
+    """Minimum numbers of found and of missed lumps for a fit."""
 
 
 FIT: Final = DetectabilityTuning()
@@ -56,9 +56,9 @@ class Surface(Row, allow_inf_nan=False):
     scale: tuple[float, ...]
     lapse: float
     quartiles: dict[str, tuple[float, float, float]]
-    """Of each covariate, in its own unit."""
+    """Quartiles of each covariate, in its own unit."""
     range: dict[str, tuple[float, float]] = Drawn
-    """Least and greatest value of each covariate."""
+    """Minimum and maximum of each covariate."""
     replicates: np.ndarray = Drawn
     """Replicates of weights and lapse, shape (folds, k + 2)."""
 
@@ -83,7 +83,7 @@ class Surface(Row, allow_inf_nan=False):
     def threshold(self, name: str, chance: float = 0.9, **others: float) -> Estimate:
         """Return the value of the covariate `name` at which P(found) is `chance`; other covariates at their medians if not given.
 
-        It is the least such value where more of the covariate helps, and the greatest where it hinders. None where that is
+        It is the lowest such value where more of the covariate helps, and the highest where it hinders. None where that is
         not within the range of the lumps: the surface is not extrapolated.
         """
         i = self.covariates.index(name)
@@ -96,12 +96,12 @@ class Surface(Row, allow_inf_nan=False):
         at = direction * np.divide(wanted, slope, out=np.full(len(slope), np.inf), where=slope > 0)
         values = self.centre[i] + self.scale[i] * at
         values = np.exp(np.minimum(values, 700)) if name in LOGARITHMIC else values
-        least, greatest = self.range[name]
-        if not least <= values[0] <= greatest:
-            beyond = "below the least" if values[0] < least else "above the greatest"
-            lengths = f"{1e3 * least:.3g} to {1e3 * greatest:.3g} mm" if name.endswith("_m") else f"{least:.3g} to {greatest:.3g}"
+        lower, upper = self.range[name]
+        if not lower <= values[0] <= upper:
+            beyond = "below the minimum" if values[0] < lower else "above the maximum"
+            lengths = f"{1e3 * lower:.3g} to {1e3 * upper:.3g} mm" if name.endswith("_m") else f"{lower:.3g} to {upper:.3g}"
             return Estimate(value=None, n=self.n, of="lumps", interval=f"{beyond} of the study, {lengths}")
-        low, high = np.clip(np.quantile(values[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest"), least, greatest)
+        low, high = np.clip(np.quantile(values[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2], method="nearest"), lower, upper)
         return Estimate(value=float(values[0]), low=float(low), high=float(high), n=self.n, of="lumps")
 
     def _z(self, lumps: dict[str, Array]) -> Array:
@@ -110,11 +110,11 @@ class Surface(Row, allow_inf_nan=False):
 
 
 def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Surface | None:
-    """Return the surface of one method; None with fewer than `FIT.fewest` lumps found or missed, or if all lumps are equal."""
+    """Return the surface of one method; None with fewer than `FIT.min_lumps` lumps found or missed, or if all lumps are equal."""
     lumps = variant.lumps.dropna(subset=list(names))
     lumps = lumps[(lumps[[name for name in names if name in LOGARITHMIC]] > 0).all(axis=1)]
     found = lumps["found"].to_numpy(dtype=bool)
-    if min(found.sum(), (~found).sum()) < FIT.fewest:
+    if min(found.sum(), (~found).sum()) < FIT.min_lumps:
         return None
     varied = tuple(name for name in names if np.ptp(lumps[name].to_numpy(dtype=np.float64)) > 1e-9)
     if not varied:
@@ -147,7 +147,7 @@ def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Sur
 
 
 def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, start: Array | None = None) -> tuple[Array, float]:
-    """Return weights and lapse of greatest likelihood, shape (k + 2,), and twice its negative logarithm.
+    """Return weights and lapse of maximum likelihood, shape (k + 2,), and twice its negative logarithm.
 
     Each row of `z`, shape (m, k + 1), was seen `count` times.
     """
@@ -155,7 +155,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
     sign = np.where(found, 1.0, -1.0)
 
     def lapse_of(free: float) -> float:
-        return FIT.greatest_lapse * float(expit(free)) if with_lapse else 0.0
+        return FIT.max_lapse * float(expit(free)) if with_lapse else 0.0
 
     def cost(parameters: Array) -> tuple[float, Array]:
         b, lapse = parameters[:k], lapse_of(float(parameters[k])) if with_lapse else 0.0
@@ -168,12 +168,12 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
         value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * FIT.prior_sd**2)
         if not with_lapse:
             return value, gradient
-        d_lapse = float(d_p @ s) * lapse * (1 - lapse / FIT.greatest_lapse)
+        d_lapse = float(d_p @ s) * lapse * (1 - lapse / FIT.max_lapse)
         return value, np.append(gradient, d_lapse)
 
     begin = np.zeros(k) if start is None else start[:k]
     if with_lapse:
-        share = 0.1 if start is None else np.clip(start[k] / FIT.greatest_lapse, 0.02, 0.98)
+        share = 0.1 if start is None else np.clip(start[k] / FIT.max_lapse, 0.02, 0.98)
         begin = np.append(begin, logit(share))
     done = minimize(cost, begin, jac=True, method="L-BFGS-B")
     lapse = lapse_of(float(done.x[k])) if with_lapse else 0.0

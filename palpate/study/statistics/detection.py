@@ -172,7 +172,7 @@ class _Marks(NamedTuple):
 def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
     """Return the curve of all examinations; None without a palpable lump.
 
-    A lump counts with the greatest confidence of the areas that hit it; an area that hits no lump is false. A failed
+    A lump counts with the highest confidence of the areas that hit it; an area that hits no lump is false. A failed
     examination of a healthy person is a false finding that no threshold removes. Between the thresholds that occur the
     curve is linear, beyond the last it is level, as in LUNA16's script.
     """
@@ -243,7 +243,7 @@ class ContrastRow(Row):
     found: Estimate
     """Share of lumps found."""
     auc: Estimate | None
-    """AUC of patients whose lump of greatest felt contrast is in this class against persons without a lump; None if either is
+    """AUC of patients whose lump of highest felt contrast is in this class against persons without a lump; None if either is
     missing."""
 
 
