@@ -75,13 +75,8 @@ def force(press: Press, radius: float = 0.01, top: float = 0.0, contrast: float 
     def compressibility(p, q, w):  # type: ignore[no-untyped-def]
         return -p * q * ratio / (shear * relative(w.x)) * w.x[0]
 
-    matrix = bmat(
-        [
-            [stiffness.assemble(displacement), divergence.assemble(displacement, pressure).T],
-            [divergence.assemble(displacement, pressure), compressibility.assemble(pressure)],
-        ],
-        "csc",
-    )
+    mixed = divergence.assemble(displacement, pressure)
+    matrix = bmat([[stiffness.assemble(displacement), mixed.T], [mixed, compressibility.assemble(pressure)]], "csc")
     at, vertical = displacement.doflocs, np.zeros(matrix.shape[0], dtype=bool)
     vertical[displacement.split_indices()[1]] = True
     vertical = vertical[: at.shape[1]]

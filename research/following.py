@@ -85,20 +85,8 @@ def reach(case: Scenario, p_W: Array, q: Array, rounds: int) -> Array:
 
 def arm(case: Scenario, t: int, q: Array, q_true: Array) -> tuple[Any, Any]:
     """Return robot/status with the measured joints, and sim/link_poses with the true ones."""
-    zero = np.zeros(7)
-    status = RobotStatus(
-        header(t),
-        RobotStatus.MODE_ACTIVE,
-        0,
-        "",
-        q,
-        zero,
-        Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)),
-        zero,
-        0,
-        "",
-        zero,
-    )
+    zero, free = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    status = RobotStatus(header(t), RobotStatus.MODE_ACTIVE, 0, "", q, zero, free, zero, 0, "", zero)
     X, links = np.eye(4), []
     for _, child, X_PC in link_transforms(q_true, case.robot):
         X = X @ X_PC

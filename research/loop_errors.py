@@ -206,14 +206,12 @@ def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, floa
     at = 0.5 * (edges[:-1] + edges[1:])[known]
     covariance = np.array([product[inside[k]].mean() for k in known])
     largest = float(np.mean([rest.var() for rest in rests]))
-    (variance, length), _ = curve_fit(
-        lambda r, variance, length: variance * np.exp(-0.5 * (r / length) ** 2),
-        at,
-        covariance / largest,
-        p0=(0.5, 0.015),
-        sigma=[inside[k].sum() ** -0.5 for k in known],
-        bounds=((0.0, 0.005), (1.0, 0.06)),
-    )
+    sigma, bounds = [inside[k].sum() ** -0.5 for k in known], ((0.0, 0.005), (1.0, 0.06))
+
+    def gaussian(r: Array, variance: float, length: float) -> Array:
+        return variance * np.exp(-0.5 * (r / length) ** 2)
+
+    (variance, length), _ = curve_fit(gaussian, at, covariance / largest, p0=(0.5, 0.015), sigma=sigma, bounds=bounds)
     return _round(np.sqrt(variance * largest)), _round(length)
 
 

@@ -14,7 +14,7 @@ import typer
 from palpate.report.archive import FILE, EvidenceError, read_evidence
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
-from palpate_bus.messages.codec import Message, decode
+from palpate_bus.messages.codec import decode
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_models.numerics.frames import Array
@@ -64,11 +64,8 @@ def _reported(folder: Path) -> tuple[Array, Array]:
     changes = [(before, state) for before, state in pairwise(states) if state.reason == ExamState.REASON_PATIENT_MOVED]
     detected = [state for before, state in changes if before.reason != state.reason]
     looked = [state for before, state in changes if before.phase != state.phase == ExamState.PHASE_LOOK]
-    return np.array([_seconds(state) for state in detected]), np.array([_seconds(state) for state in looked])
-
-
-def _seconds(state: Message) -> float:
-    return nanoseconds(state.header.stamp) / NS
+    at, again = ([nanoseconds(state.header.stamp) / NS for state in found] for found in (detected, looked))
+    return np.array(at), np.array(again)
 
 
 def main(folders: Annotated[list[Path], typer.Argument(help="Folders of runs whose patients move.")]) -> None:

@@ -56,12 +56,8 @@ def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
         add("ft/wrench", WrenchStamped(header(t, "ft_sensor"), wrench), t, i)
         add("sim/contact_wrench", WrenchStamped(header(t, "world"), wrench), t, i)
         add("sim/tool_state", ToolState(header(t, "world"), pose, Twist(vector(), vector()), 0.015), t, i)
-        add(
-            "control/joint_torque",
-            JointTorqueCommand(header(t), random.normal(size=7), np.zeros(0), Duration(0, 50 * MS), "", ""),
-            t,
-            i,
-        )
+        command = JointTorqueCommand(header(t), random.normal(size=7), np.zeros(0), Duration(0, 50 * MS), "", "")
+        add("control/joint_torque", command, t, i)
         if i % 50 == 0:
             dent = 0.01 * np.exp(-((grid - (0.1 * np.sin(t / 1e9), 0)) ** 2).sum(axis=1) / 8e-4)
             vertices = np.column_stack((grid, -dent)).astype(np.float32).ravel()

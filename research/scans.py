@@ -134,13 +134,8 @@ def scan(
     xy = np.column_stack([a.ravel() for a in np.meshgrid(grid, grid)])
     p, n = shape(xy)
     perceived = p + n * wrong(p)[:, None]
-    surface = SurfaceMesh(
-        header(0, "world"),
-        apply(X_WA, perceived).astype(np.float32).ravel(),
-        np.empty(0, np.float32),
-        np.empty(0, np.uint32),
-        np.empty(0, np.float32),
-    )
+    vertices, empty = apply(X_WA, perceived).astype(np.float32).ravel(), np.empty(0, np.float32)
+    surface = SurfaceMesh(header(0, "world"), vertices, empty, np.empty(0, np.uint32), empty)
     states: list[Any] = []
     zero = np.zeros(3)
     extent = region or exam.region_m

@@ -60,18 +60,11 @@ def serve(tree: str, answers: IO[str]) -> None:
 
 def started(tree: Path) -> subprocess.Popen[str]:
     """Return the composed run of a checkout, whose packages come before those that are installed."""
-    folders = (
-        tree,
-        *(tree / name for name in ("bus", "models", "dashboards", "fmus/abdomen")),
-        *sorted((tree / "services").iterdir()),
-    )
-    return subprocess.Popen(
-        [sys.executable, "-P", str(Path(__file__)), SERVE, str(tree)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    packages = [tree / name for name in ("bus", "models", "dashboards", "fmus/abdomen")]
+    path = os.pathsep.join(map(str, (tree, *packages, *sorted((tree / "services").iterdir()))))
+    words = [sys.executable, "-P", str(Path(__file__)), SERVE, str(tree)]
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen(words, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def _answer(run: subprocess.Popen[str], question: str = "") -> str:

@@ -1,1 +1,1 @@
-"""Figures and claims of the seed paper, reproduced by runs of Palpate."""
+"""Figures and claims of the original paper, reproduced by runs of Palpate."""

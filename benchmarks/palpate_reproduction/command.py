@@ -1,4 +1,4 @@
-"""`palpate reproduce`: figures and claims of the seed paper from new runs, compared with the paper."""
+"""`palpate reproduce`: figures and claims of the original paper from new runs, compared with the paper."""
 
 from itertools import count
 from pathlib import Path
@@ -22,7 +22,7 @@ def reproduce(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the page's path only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Reproduce figures 3, 5, 6, 7 and 8 and the claims of the seed paper from new runs. This takes about ten minutes."""
+    """Reproduce figures 3, 5, 6, 7 and 8 and the claims of the original paper from new runs. This takes about ten minutes."""
     from palpate.report.archive import EvidenceError, read_completed
     from palpate.run.inputs import check_usable
     from palpate_reproduction.page import write_page

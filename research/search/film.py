@@ -1,6 +1,5 @@
 """A film of a search: `python -m research.search.film` searches a patient and draws the presses and the belief after each."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -42,7 +41,8 @@ def main(
     writer = PillowWriter(fps=3)
     x, y = (np.unique(axis) for axis in hand.task.places.T)
     with writer.saving(figure, str(out), dpi=75):
-        for k in _frames(len(trial.near)):
+        last = len(trial.near) - 1
+        for k in [*range(last), *[last] * 7]:  # the last frame stays
             map_axes.clear()
             probability_axes.clear()
             map_axes.pcolormesh(
@@ -59,11 +59,6 @@ def main(
             probability_axes.legend(loc="lower right", fontsize=8)
             writer.grab_frame()
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {len(trial.near)} presses, {trial.seconds[-1]:.0f} s")
-
-
-def _frames(count: int) -> Iterator[int]:
-    yield from range(count)
-    yield from [count - 1] * 6  # the last frame stays
 
 
 if __name__ == "__main__":

@@ -243,7 +243,7 @@ class ContrastRow(Row):
     found: Estimate
     """Share of lumps found."""
     auc: Estimate | None
-    """AUC of patients whose lump of highest felt contrast is in this class against persons without a lump; None if either is
+    """AUC of patients whose lump of highest felt contrast is in this class against patients without a lump; None if either is
     missing."""
 
 
