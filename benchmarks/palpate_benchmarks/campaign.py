@@ -52,10 +52,7 @@ FIXED: Final = (
     CONDUCTOR,
     "recorder",
     DASHBOARD,
-    "planning+conductor",
-    "control+conductor",
-    "supervisor+conductor",
-    "recorder+conductor",
+    *(f"{role}{TOGETHER}{CONDUCTOR}" for role in ("planning", "control", "supervisor", "recorder")),
     "control+recorder",
     "planning+supervisor",
 )
@@ -64,12 +61,10 @@ PARTITION: Final = "partition"
 MACHINE: Final = "machine"
 NETWORK: Final = f"palpate-{os.getpid()}"
 """Name of the network namespace of a partition."""
-LATE: Final = frozenset(
-    {
-        ("driver", RobotStatus.CAUSE_COMMAND_EXPIRED),
-        ("driver", RobotStatus.CAUSE_DEVICE),
-        ("supervisor", SupervisorState.CAUSE_SILENT),
-    }
+LATE: Final = (
+    ("driver", RobotStatus.CAUSE_COMMAND_EXPIRED),
+    ("driver", RobotStatus.CAUSE_DEVICE),
+    ("supervisor", SupervisorState.CAUSE_SILENT),
 )
 """Sources and causes of the signs of a machine that is too slow."""
 
