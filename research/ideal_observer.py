@@ -25,7 +25,7 @@ from palpate.quick.errors import loop_errors
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import detect
-from palpate_assessment.model import errors, fixed_covariance
+from palpate_assessment.model import error_covariances, fixed_covariance
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
@@ -73,7 +73,7 @@ def ideal(o: Observations, length: float) -> float:
     S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
     S += ERRORS.field_m**2 * lever * np.exp(-0.5 * apart / FIELD_LENGTH_M**2)
     for sd, part in zip(
-        (ERRORS.stroke_m, ERRORS.breathing_m, ERRORS.depth_m * float(np.median(o.per_metre))), errors(o), strict=True
+        (ERRORS.stroke_m, ERRORS.breathing_m, ERRORS.depth_m * float(np.median(o.per_metre))), error_covariances(o), strict=True
     ):
         S += sd**2 * part
     triangle = cholesky(S, lower=True)

@@ -36,11 +36,12 @@ class Setpoint(NamedTuple):
     V_WD: Array
     """Desired twist in world axes, linear [m/s] then angular [rad/s], shape (6,)."""
     F_W: Array
-    """Feed-forward wrench on the environment at D's origin, force [N] then torque [N m], world axes, shape (6,)."""
+    """Feed-forward wrench of the indenter on the environment at D's origin, force [N] then torque [N m], world axes, shape (6,).
+    The tissue's `F_W` is the wrench on the indenter."""
     stiffness: Array
-    """In axes of D: translation [N/m], rotation [N m/rad], shape (6,)."""
+    """Stiffness in axes of D: translation [N/m], rotation [N m/rad], shape (6,)."""
     damping_ratio: Array
-    """[1], shape (6,)."""
+    """Damping ratio in axes of D [1], shape (6,)."""
     q: Array
     """JOINT: target; CARTESIAN: null-space posture [rad], shape (n,)."""
     qd: Array

@@ -38,7 +38,7 @@ class InputError(UserError):
 
 
 class Bounds(NamedTuple):
-    """Largest inputs. PALPATE_BOUNDS changes them, such as `unpacked_mb=4096,chunk_mb=128`."""
+    """Maximum sizes of inputs. PALPATE_BOUNDS changes them, such as `unpacked_mb=4096,chunk_mb=128`."""
 
     text_kb: int = 512
     """YAML, which is read at about 0.1 MB/s."""
@@ -84,9 +84,9 @@ def over(name: object, what: str, allowed: str, error: type[UserError] = InputEr
 
 
 class InputFile(io.BufferedReader):
-    """A regular file open for reading. No single read allocates more than the file has, or than `most` bytes."""
+    """A regular file open for reading. No single read allocates more than the file has, or than `max_bytes` bytes."""
 
-    def __init__(self, path: Path, error: type[UserError] = InputError, most: int | None = None) -> None:
+    def __init__(self, path: Path, error: type[UserError] = InputError, max_bytes: int | None = None) -> None:
         """Open without waiting for a writer of a pipe. Raises `error` for a pipe, a device or a folder, OSError."""
         raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
         mode = os.fstat(raw.fileno()).st_mode
@@ -94,28 +94,28 @@ class InputFile(io.BufferedReader):
             raw.close()
             raise error(f"{path}: is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; want a regular file")
         super().__init__(raw)
-        self._most, self._error, self._path = bounds().file_mb * MB if most is None else most, error, path
+        self._max_bytes, self._error, self._path = bounds().file_mb * MB if max_bytes is None else max_bytes, error, path
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Return up to `size` bytes, all without a size. Raises the error of the file if these are too many."""
         if size is None or size < 0 or size > _CHECKED_READ:
             there = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
             size = there if size is None or size < 0 else min(size, there)
-            if size > self._most:
-                raise self._error(f"{self._path}: {size} bytes in one piece; allowed are {self._most} ({VARIABLE})")
+            if size > self._max_bytes:
+                raise self._error(f"{self._path}: {size} bytes in one piece; allowed are {self._max_bytes} ({VARIABLE})")
         return super().read(size)
 
 
-def read_bytes(path: Path, error: type[UserError] = InputError, most: int | None = None) -> bytes:
-    """Return the content of a regular file of at most `most` bytes. Raises `error`, OSError."""
-    with InputFile(path, error, most) as file:
+def read_bytes(path: Path, error: type[UserError] = InputError, max_bytes: int | None = None) -> bytes:
+    """Return the content of a regular file of at most `max_bytes` bytes. Raises `error`, OSError."""
+    with InputFile(path, error, max_bytes) as file:
         return file.read()
 
 
-def read_text(path: Path, error: type[UserError] = InputError, most: int | None = None) -> str:
+def read_text(path: Path, error: type[UserError] = InputError, max_bytes: int | None = None) -> str:
     """Return the text of a regular UTF-8 file, by default of at most `document_mb`. Raises `error`, OSError."""
     try:
-        return read_bytes(path, error, bounds().document_mb * MB if most is None else most).decode()
+        return read_bytes(path, error, bounds().document_mb * MB if max_bytes is None else max_bytes).decode()
     except UnicodeDecodeError as problem:
         raise error(f"{path}: not UTF-8: {problem.reason} at byte {problem.start}") from problem
 

@@ -147,7 +147,7 @@ def test_a_read_allocates_no_more_than_the_file_has(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     with InputFile(tmp_path / "a") as file:
         assert file.read(1 << 60) == b"abc"
-    with InputFile(tmp_path / "a", most=2) as file, pytest.raises(InputError, match="3 bytes in one piece; allowed are 2"):
+    with InputFile(tmp_path / "a", max_bytes=2) as file, pytest.raises(InputError, match="3 bytes in one piece; allowed are 2"):
         file.read()
 
 

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from palpate.search.hand import SurrogateHand
 from palpate.search.trial import case, search
 from palpate_assessment.calibration import load_calibration
-from palpate_assessment.model import natural
+from palpate_assessment.model import field_covariances
 from palpate_assessment.standard import LENGTHS, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
@@ -42,7 +42,7 @@ def felt(seed: int, presses: int) -> tuple[Array, Array, Array]:
     depth, force, unsure = np.array([(one.depth, max(one.force, 0.1), one.depth_uncertainty) for one in made]).T
     error = exponent / depth * unsure
     near = np.exp(-0.5 * ((xy[:, None] - xy) ** 2).sum(axis=2) / USUAL.errors.surface_m**2)
-    parts = [*natural(xy, xy, USUAL), np.outer(error, error) * near, np.diag(error**2), np.ones((len(xy), len(xy)))]
+    parts = [*field_covariances(xy, xy, USUAL), np.outer(error, error) * near, np.diag(error**2), np.ones((len(xy), len(xy)))]
     noise = np.diag((made[0].noise_n ** 2 + USUAL.tare_n**2) / force**2 + USUAL.errors.white_sd**2)
     return np.log(force) - exponent * np.log(depth / press.DEPTH_M), np.array(parts), noise
 

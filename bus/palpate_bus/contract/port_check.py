@@ -108,26 +108,28 @@ def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> I
         yield MessageViolation(ViolationKind.STAMP, "header.stamp", f"at most {AHEAD_NS / 1e6:g} ms ahead", got)
     compared = all(getattr(message, field) == value for field, value in topic.compared_while.items())
     for path, rate in topic.rates.items() if past.message is not None and compared else ():
-        most = rate * (stamp - past.stamp) / 1e9
-        if text := _too_fast(message, past.message, path, most):
+        max_change = rate * (stamp - past.stamp) / 1e9
+        if text := _too_fast(message, past.message, path, max_change):
             allowed = f"a change of {rate:g} {topic.units.get(path, 'rad')} per second"
             got = f"{text}, {(stamp - past.stamp) / 1e6:g} ms apart"
             yield MessageViolation(ViolationKind.CHANGE, path, allowed, got)
-    for count, (path, most) in zip(past.repeats, topic.varies.items(), strict=True):
-        if count >= most and repeats(message, past.message, path):
+    for count, (path, max_repeats) in zip(past.repeats, topic.varies.items(), strict=True):
+        if count >= max_repeats and repeats(message, past.message, path):
             values = numbers(message, path)
             text = f"{values.tolist() if values.size <= SHOWN else 'the same values'} in {count + 2} messages in a row"
-            yield MessageViolation(ViolationKind.FROZEN, path, f"at most {most + 1} equal ones: a live sensor has noise", text)
+            yield MessageViolation(
+                ViolationKind.FROZEN, path, f"at most {max_repeats + 1} equal ones: a live sensor has noise", text
+            )
 
 
-def _too_fast(message: Message, before: Message, path: str, most: float) -> str:
-    """Return the values of a field that changes by more than `most`, and those before; empty if it does not."""
+def _too_fast(message: Message, before: Message, path: str, max_change: float) -> str:
+    """Return the values of a field that changes by more than `max_change`, and those before; empty if it does not."""
     if leaves(message.__msgtype__, path)[0].message == QUATERNION:
         turned = turn(attrgetter(path)(message), attrgetter(path)(before))
-        return "" if turned <= most else f"{turned:g} rad from the one before"
+        return "" if turned <= max_change else f"{turned:g} rad from the one before"
     now, then = numbers(message, path), numbers(before, path)
     worst = int(np.argmax(np.abs(now - then))) if now.size else 0
-    return "" if not now.size or abs(now[worst] - then[worst]) <= most else f"{now[worst]:g} after {then[worst]:g}"
+    return "" if not now.size or abs(now[worst] - then[worst]) <= max_change else f"{now[worst]:g} after {then[worst]:g}"
 
 
 FEW = 32
@@ -234,14 +236,14 @@ def violations(topic: Topic, message: Message) -> list[str]:
     return [f"{topic.name}: {violation}" for violation in Checker(topic)(message)]
 
 
-def _out_of_range(path: str, values: np.ndarray[Any, Any], least: float, most: float, unit: str) -> MessageViolation:
-    wrong = values[~((values >= least) & (values <= most))]
-    allowed = f"{least:g}..{most:g} [{unit}]"
+def _out_of_range(path: str, values: np.ndarray[Any, Any], low: float, high: float, unit: str) -> MessageViolation:
+    wrong = values[~((values >= low) & (values <= high))]
+    allowed = f"{low:g}..{high:g} [{unit}]"
     unfit = wrong[~np.isfinite(wrong)]
     if unfit.size:
         return MessageViolation(ViolationKind.NAN, path, allowed, f"{unfit[0]:g}")
     name, factor = _CONFUSED.get(unit, ("", np.nan))
-    if np.all((values * factor >= least) & (values * factor <= most)):
+    if np.all((values * factor >= low) & (values * factor <= high)):
         return MessageViolation(ViolationKind.UNIT, path, allowed, f"{wrong[0]:g}, plausible if it is in {name}")
     return MessageViolation(ViolationKind.RANGE, path, allowed, f"{wrong[0]:g}")
 
@@ -307,26 +309,26 @@ class _Source:
         for path, rate in self._topic.rates.items():
             yield f"most = {rate * 1e-9!r} * (stamp - past.stamp)"
             if leaves(self._topic.type, path)[0].message == QUATERNION:
-                yield f"if not turn(m.{path}, before.{path}) <= most: return False"
+                yield f"if not turn(m.{path}, before.{path}) <= max_change: return False"
                 continue
             for leaf in leaves(self._topic.type, path):
                 yield f"change = m.{leaf.path} - before.{leaf.path}"
                 if leaf.array:
-                    yield "if not change.dot(change) <= most * most:"
+                    yield "if not change.dot(change) <= max_change * max_change:"
                     yield " for one in change.tolist():"
-                    yield "  if not -most <= one <= most: return False"
+                    yield "  if not -max_change <= one <= max_change: return False"
                 else:
-                    yield "if not -most <= change <= most: return False"
+                    yield "if not -max_change <= change <= max_change: return False"
 
     def _varies(self) -> Iterator[str]:
         """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
-        for k, (path, most) in enumerate(self._topic.varies.items()):
+        for k, (path, max_repeats) in enumerate(self._topic.varies.items()):
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
             none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
             yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
-            yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
+            yield f"elif past.repeats[{k}] < {max_repeats}: past.repeats[{k}] += 1"
             yield "else: return False"
 
     def _new(self) -> str:

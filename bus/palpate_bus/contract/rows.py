@@ -98,7 +98,7 @@ class Topic(_Row):
     units: dict[str, str] = {}
     ranges: dict[str, tuple[float, float]] = {}
     rates: dict[str, float] = {}
-    """Greatest change per second of each number; of a quaternion, greatest rate of turning [rad/s]."""
+    """Maximum change per second of each number; for a quaternion, maximum rate of turning [rad/s]."""
     varies: dict[str, int] = {}
     """Number of messages in a row whose field may repeat exactly."""
     compared_while: dict[str, int | str] = {}
@@ -106,13 +106,13 @@ class Topic(_Row):
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0
-    """With --record normal the recorder keeps one message in this time; 0: every message."""
+    """Interval in which the recorder keeps one message with --record normal; 0: it keeps every message."""
     open: bool = False
     """Senders other than the producer are allowed."""
     tagged: bool = False
-    """In runs with a key, its messages carry an authentication tag."""
+    """Its messages carry an authentication tag in runs with a key."""
     tagged_values: dict[str, tuple[int, ...]] = {}
-    """Of an open topic: field values that are accepted with a tag only; other messages are accepted from anyone."""
+    """Field values of an open topic that are accepted with a tag only; other messages are accepted from anyone."""
     doc: str
 
     @property
@@ -171,9 +171,9 @@ class Internal(_Row):
     readers: str
     period_ms: int | None = None
     deadline_ms: int | None = None
-    """In wall-clock mode the sender is lost after this time without a message."""
+    """Maximum time without a message in wall-clock mode; then the sender is lost."""
     tagged: bool = False
-    """In runs with a key, its messages carry an authentication tag."""
+    """Its messages carry an authentication tag in runs with a key."""
     doc: str
 
     @property

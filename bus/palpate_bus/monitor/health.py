@@ -123,7 +123,7 @@ class StreamTuning(NamedTuple):
     window_s: float = 0.7
     """Averaging window of rates [s], wall time; a wrong rate is found within a second."""
     rate_tolerance: float = 0.2
-    least_off: int = 3
+    min_off: int = 3
     """A rate is wrong when more than this many messages, and more than `rate_tolerance` of them, are missing or too many."""
     silence_ns: int = 100 * MS
     """Bus time without a message after which a topic is silent."""
@@ -223,7 +223,7 @@ def timing_violations(topic: Topic, stream: Stream, time: BusTime, rate: float |
     spent = own.sent * rate if rate else own.stamps
     if spent:
         off = abs(own.messages - spent / topic.period)
-        if off > TUNING.least_off and off > TUNING.rate_tolerance * spent / topic.period:
+        if off > TUNING.min_off and off > TUNING.rate_tolerance * spent / topic.period:
             unit = wanted.partition(" ")[2]
             yield MessageViolation(Kind.RATE, "", wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
     yield from _age(topic, stream, time, rate)
@@ -231,7 +231,7 @@ def timing_violations(topic: Topic, stream: Stream, time: BusTime, rate: float |
 
 def is_due(topic: Topic, time: BusTime) -> bool:
     """Return True if enough bus time passed for several messages of a periodic topic."""
-    return time.passed / topic.period > TUNING.least_off
+    return time.passed / topic.period > TUNING.min_off
 
 
 def _age(topic: Topic, stream: Stream, time: BusTime, rate: float | None) -> Iterator[MessageViolation]:

@@ -248,9 +248,9 @@ class LiveMonitor:
         self.monitor = Monitor(rules, rate)
         self.graph = GraphWatch(session, domain)
         self.reports: dict[str, tuple[ServiceReport, float]] = {}
-        """By role, its last report and when it was received, by the monotonic clock [s]."""
+        """Last report by role, and the monotonic time of its receipt [s]."""
         self.offsets: dict[str, float] = {}
-        """Smallest age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
+        """Minimum age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
         self._subscribers: dict[str, Any] = {}
         self.listen(rules.topics if topics is None else topics)

@@ -48,7 +48,7 @@ class LinkTimes(NamedTuple):
     busy_s: float = 2.0
     """Limit for a silent conductor whose process runs, so that it is starved of CPU."""
     lockstep_busy_s: float = 30.0
-    """As `busy_s`, in lockstep, where waiting is safe: an overloaded machine starves a conductor for seconds."""
+    """Limit in lockstep, where waiting is safe: an overloaded machine starves a conductor for seconds."""
 
 
 TIMES: Final = LinkTimes()

@@ -151,10 +151,10 @@ class RemoteInputs:
         self._advances = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
         self.subscriptions = (*self._data.values(), *self._advances.values())
         self._last: dict[str, tuple[int, int]] = {}
-        """By topic, sequence number and sending time of the newest message."""
+        """Sequence number and sending time of the newest message by topic."""
         self._event_topics = {role: event_topics(self._rules, role) for role in producers}
         self._closed = dict.fromkeys(producers, 0)
-        """By role, the sequence number of the newest Advance."""
+        """Sequence number of the newest Advance by role."""
 
     def missing_inputs(self) -> list[str]:
         """Return the keys, without their hash, of the awaited inputs on which no hello was received."""

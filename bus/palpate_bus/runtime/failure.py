@@ -19,9 +19,9 @@ class FailureCode(StrEnum):
     """Cause of the early end of a run."""
 
     INTERRUPTED = "interrupted"
-    """By Ctrl-C or SIGTERM."""
+    """Ctrl-C or SIGTERM ended the run."""
     STOPPED = "stopped"
-    """By the program that conducts the run."""
+    """The program that conducts the run ended it."""
     START_FAILED = "start_failed"
     """A service raised or its process exited before the first tick."""
     NO_ANSWER = "no_answer"
@@ -48,7 +48,7 @@ class FailureCode(StrEnum):
     UNFINISHED = "unfinished"
     """Recovered from a recording without an end."""
     DAMAGED = "damaged"
-    """The same, and parts of the recording are lost."""
+    """Recovered from a recording without an end, parts of which are lost."""
     INTERNAL = "internal"
     """An unexpected error in the conductor."""
 

@@ -27,7 +27,7 @@ class Blame:
     """Wall time [ns] of one service by activity, and waiting time by role."""
 
     compute: int = 0
-    """In `step`, without decoding."""
+    """Time in `step`, without decoding."""
     encode: int = 0
     decode: int = 0
     send: int = 0
@@ -327,7 +327,7 @@ class Stepper:
         return [one for part in self.parts(t) for one in part]
 
     def parts(self, t: int) -> Iterator[list[Sent]]:
-        """As `step`, but yields the messages of each part of the step before the next is computed."""
+        """Do what `step` does, but yield the messages of each part of the step before the next is computed."""
         blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
         for outbox in self._outboxes(t):

@@ -262,7 +262,7 @@ class RecorderNode(ObserverNode):
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
         self._numbers = dict.fromkeys(producers, 0)
-        """By role, the sequence number of the newest chunk."""
+        """Sequence number of the newest chunk by role."""
         # messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others
         inputs = member.rules.inputs(self._service.role)
         direct = [topic for topic, _ in inputs if member.rules.roles[topic.producer].observer]

@@ -16,9 +16,9 @@ from palpate_bus.messages.stamps import MS
 GC_THRESHOLD = 100_000
 """New objects before a garbage collection. Messages form no cycles: a run of 50 s leaves 2000 objects in cycles."""
 WORKER_NICENESS = 15
-"""In wall-clock mode, of a thread that computes for seconds: a planner must not take the core of the 1 kHz loop."""
+"""Niceness, in wall-clock mode, of a thread that computes for seconds: a planner must not take the core of the 1 kHz loop."""
 BACKGROUND_NICENESS = 3
-"""Of observers, and in lockstep of services slower than the 1 kHz loop, which are batch work as well.
+"""Niceness of observers, and in lockstep of services slower than the 1 kHz loop, which are batch work as well.
 
 The loop waits for them, so with a higher value a run starves next to other work. Toy services, 2 s of simulated time on two
 loaded cores next to two busy processes, interleaved: with 15 no end within 100 s, and a lost message; with 3 in 6.5 and 11.5 s.
@@ -96,7 +96,7 @@ class Standstill(NamedTuple):
 
     pid: int
     status: str
-    """As psutil names it; empty if the process cannot be inspected."""
+    """State by psutil's name; empty if the process cannot be inspected."""
     seconds: float
     """Time without processor time and without waiting for a core; 0 while it makes progress."""
 

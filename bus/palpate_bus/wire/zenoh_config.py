@@ -297,7 +297,7 @@ def free_port() -> int:
 
 
 DEFAULT_ENDPOINT = "tcp/[::]:7447"
-"""As of zenohd and rmw_zenohd."""
+"""Endpoint on which zenohd and rmw_zenohd listen by default."""
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from scipy.special import chdtrc, logit
 from palpate_assessment.detection import Candidate, detect
 from palpate_assessment.findings import Z90, Area, areas
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.model import Regression, inverse, usual_amplitudes
+from palpate_assessment.model import Regression, cholesky_inverse, prior_log_amplitudes
 from palpate_assessment.observations import USABLE, Observations, distance_to_samples, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
@@ -88,7 +88,7 @@ def weigh_all(o: Observations) -> tuple[Regression, list[Candidate], NDArray[np.
     """
     reasons = np.where(o.yielded, UnassessedReason.YIELDED, UnassessedReason.ASSESSED)
     telling = np.flatnonzero(~o.yielded)
-    if len(telling) < USABLE.fewest:
+    if len(telling) < USABLE.min_samples:
         return None
     regression, candidates = detect(o.part(telling))
     wrong = find_contradicted(regression)
@@ -110,7 +110,7 @@ def find_contradicted(regression: Regression) -> NDArray[np.bool_]:
     covariance (P_kk)^-1 (Rasmussen and Williams 2006, sec. 5.4.2), so e' P_kk e is chi-squared if the model holds.
     """
     o = regression.observations
-    precision = inverse(regression.triangle)
+    precision = cholesky_inverse(regression.cholesky_factor)
     pull = precision @ (o.y - regression.level)
     marked = np.zeros(len(o.y), dtype=bool)
     for piece in pieces(o):
@@ -137,7 +137,7 @@ def assess_growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) 
         return None
     apart = distance_to_samples(grid.nodes[:, :2], samples, USUAL)
     unassessed = np.where(apart <= reach, UnassessedReason.ASSESSED, UnassessedReason.NOT_REACHED).astype(np.uint8)
-    return _assessment(Regression(o, (), usual_amplitudes(o)), grid, unassessed, [], [])
+    return _assessment(Regression(o, (), prior_log_amplitudes(o)), grid, unassessed, [], [])
 
 
 def _assessment(

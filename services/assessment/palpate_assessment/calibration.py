@@ -36,13 +36,13 @@ class Calibration(BaseModel):
     ridge: tuple[float, float, float, float]
     """Weights of the evidence for a ridge (`Candidate.structures`) in its log odds against a lump, the constant first."""
     bone: tuple[float, float, float, float, float]
-    """The same of bone."""
+    """Weights of the evidence for bone in its log odds against a lump, the constant first."""
     soft: tuple[float, float, float, float]
-    """The same of a soft defect."""
+    """Weights of the evidence for a soft defect in its log odds against a lump, the constant first."""
     prevalence: float
     """Share of the persons of the fit who have a lump that can be felt."""
     tail: tuple[float, float]
-    """Location and scale of a healthy examination's greatest logit: P(greatest > s) = exp(-(s - location) / scale)."""
+    """Location and scale of a healthy examination's maximum logit: P(max > s) = exp(-(s - location) / scale)."""
 
     def logit(self, features: Array) -> Array:
         """Logits of the probability of candidates with `features`, shape (k, f) -> (k,)."""

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 
-from palpate_assessment.model import KINDS_OF_ERROR, PRIOR, Regression, amplitudes, inverse, usual_amplitudes
+from palpate_assessment.model import KINDS_OF_ERROR, PRIOR, Regression, cholesky_inverse, fit_log_amplitudes, prior_log_amplitudes
 from palpate_assessment.observations import USABLE, Observations
 from palpate_assessment.shapes import Bump, ridge
 from palpate_assessment.standard import ABDOMEN, LENGTHS
@@ -45,14 +45,14 @@ class ShapeSearch(NamedTuple):
     starts: int = 3
     """Bumps apart from each other that are refined where no anatomy is assumed: a small lump may be between those tried first."""
     widest: float = 1.3
-    """Largest radius over the largest one of the bumps that are tried first."""
-    most: int = 4
-    """Largest number of lumps where there is probably no bone."""
-    most_with_bone: int = 7
+    """Maximum radius over the largest one of the bumps that are tried first."""
+    max_lumps: int = 4
+    """Maximum number of lumps where there is probably no bone."""
+    max_with_bone: int = 7
     bone: float = 0.6
     """Prior of bone from which a place counts as bone."""
     weakest_t: float = 3.0
-    """Least t with which a lump is weighed."""
+    """Minimum t with which a lump is weighed."""
     too_near: float = 0.7
     """Two lumps are at least this part of the sum of their radii apart."""
     alike: float = 1.5
@@ -62,19 +62,19 @@ class ShapeSearch(NamedTuple):
     half_lengths: tuple[float, ...] = (0.75, 1.5)
     """Half of their lengths, over the radius of the largest bump."""
     narrowest: float = 0.5
-    """Least radius or half width where no anatomy is assumed, over that of the smallest bump."""
+    """Minimum radius or half width where no anatomy is assumed, over that of the smallest bump."""
     turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
     """Angles [rad] by which a ridge may turn from one piece to the next."""
     gain: float = 1.6
     """Gain of the log evidence from which a ridge becomes longer by a piece: the logarithm of the number of turns."""
     usual: int = 2
     """Index of the usual radius, which is the length of a piece."""
-    least_gain: float = 0.0
+    min_gain: float = 0.0
     """Log Bayes factor, over all places, below which no more lumps are sought where no anatomy is assumed."""
     surrounded: float = 0.5
-    """Least share of a structure's outline that is within the samples where no anatomy is assumed: it may be at the border."""
+    """Minimum share of a structure's outline that is within the samples where no anatomy is assumed: it may be at the border."""
     narrow: float = 0.354
-    """Largest radius, over the lesser width of the samples, where no anatomy is assumed: within a circle of that width, a disc of
+    """Maximum radius, over the lesser width of the samples, where no anatomy is assumed: within a circle of that width, a disc of
     1/sqrt(8) of it has as much area as its surroundings."""
     rival_offsets_m: tuple[float, ...] = (-0.012, 0.0, 0.012)
     """Distances of the middles of ridges from the disc that they may be instead, along each axis."""
@@ -172,7 +172,7 @@ class Candidate(NamedTuple):
 
     @property
     def beyond(self) -> float:
-        """By how many of its standard deviations the contrast exceeds FELT, within SURE."""
+        """Excess of the contrast over FELT in its standard deviations, limited to +-SURE."""
         contrast = abs(self.log_contrast)
         return float(np.clip((contrast - np.log(FELT)) * abs(self.t) / max(contrast, 1e-9), -SURE, SURE))
 
@@ -186,9 +186,9 @@ def match_bumps(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, A
 
 def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
     """Return the regression with the detected lumps, and these lumps, each evaluated with the others in the model."""
-    steps = [Regression(o, (), amplitudes(o, ()))]
+    steps = [Regression(o, (), fit_log_amplitudes(o, ()))]
     shapes: list[tuple[Bump, Bump | None]] = []
-    while len(steps) <= SEARCH.most_with_bone and _open_wall(steps[-1]) < SEARCH.most:
+    while len(steps) <= SEARCH.max_with_bone and _open_wall(steps[-1]) < SEARCH.max_lumps:
         last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmask(steps[-1]))
         found = [find_disc(last), *([] if o.standard.anatomy else [find_ridge(last)])]
         bumps = [bump for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
@@ -196,11 +196,11 @@ def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
             shapes.append((bumps[0], ridge_instead(last, bumps[0])))
             bumps = [prefer(last, *shapes[-1])]
         lumps = [(*last.lumps, bump) for bump in bumps]
-        more = [Regression(o, some, amplitudes(o, some, last.log_amplitudes)) for some in lumps]
+        more = [Regression(o, some, fit_log_amplitudes(o, some, last.log_amplitudes)) for some in lumps]
         if not more:
             break
         best = more[0] if o.standard.anatomy else max(more, key=partial(measure_gain, steps[-1]))
-        if o.standard.anatomy is None and measure_gain(steps[-1], best) < SEARCH.least_gain:
+        if o.standard.anatomy is None and measure_gain(steps[-1], best) < SEARCH.min_gain:
             break
         steps.append(best)
     both = shapes or [(lump, None) for lump in steps[-1].lumps]
@@ -221,7 +221,7 @@ def unmask(regression: Regression) -> Array:
     counts as natural variation, and would hide itself.
     """
     fields = len(regression.log_amplitudes) - KINDS_OF_ERROR
-    usual = usual_amplitudes(regression.observations)
+    usual = prior_log_amplitudes(regression.observations)
     return np.concatenate((np.minimum(regression.log_amplitudes, usual)[:fields], regression.log_amplitudes[fields:]))
 
 
@@ -291,13 +291,13 @@ def limit_strength(regression: Regression, lump: Bump, t: float) -> float:
     if np.ptp(o.stroke) == 0:
         return t
     height = lump(o.xy)
-    precision = inverse(regression.triangle)
+    precision = cholesky_inverse(regression.cholesky_factor)
     y = o.y - regression.level
     pulls = precision @ np.column_stack((height, y))
     left = np.inf
     for stroke in np.unique(o.stroke[height > SEARCH.crossed * height.max()]):
         own = np.flatnonzero(o.stroke == stroke)
-        if len(o.y) - len(own) < USABLE.fewest:
+        if len(o.y) - len(own) < USABLE.min_samples:
             continue
         lost = np.linalg.solve(precision[np.ix_(own, own)], pulls[own])
         power = height @ pulls[:, 0] - pulls[own, 0] @ lost[:, 0]

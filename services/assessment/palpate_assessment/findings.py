@@ -33,7 +33,7 @@ class StatedPrior(NamedTuple):
     structures: float = 0.5
     """Expected number of structures in the region, of each size equally many, anywhere."""
     contrast: float = 1.1
-    """Least contrast of a structure."""
+    """Minimum contrast of a structure."""
 
 
 STATED = StatedPrior()
@@ -57,7 +57,7 @@ class Area(NamedTuple):
     centroid: Array
     """Centroid of the area [m], shape (3,)."""
     area: float
-    """On the surface [m^2]."""
+    """Area on the surface [m^2]."""
     ratio: float
     """Apparent stiffness against the surroundings, geometric mean over the area [1]."""
     ratio_lower: float
@@ -68,15 +68,15 @@ class Area(NamedTuple):
     logit: float
     """Its log-odds at the prevalence of the fit, by which the operating point is chosen."""
     guarding: float
-    """Probability that it is a tensed muscle."""
+    """Probability that the lump is a tensed muscle."""
     ridge: float
-    """Probability that it is a scar or another ridge."""
+    """Probability that the lump is a scar or another ridge."""
     bone: float
-    """Probability that it is bone."""
+    """Probability that the lump is bone."""
     soft: float
-    """Probability that it is a soft defect of the wall, such as a hernia."""
+    """Probability that the lump is a soft defect of the wall, such as a hernia."""
     kind: Kind
-    """The most probable of these."""
+    """Most probable kind."""
     strength: float
     """Absolute log-contrast divided by its SD."""
     length: float

@@ -2,9 +2,11 @@
 
     y = z(x) + (n - n0) log(d / D) + (n / d) (onset + stroke zero + breathing left over + surface(x)) + force zero / F_s + noise
 
-z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline (muscles and the linea alba), of
-bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of all parts but the lumps are found
-as the mode of their posterior under log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
+y is the log force, d the depth, D the depth of the standard press, n the exponent of this wall and n0 the usual one, and F_s the
+median force of the stroke. z is a sum of fields of several lengths, of vertical strips that are symmetric about the midline
+(muscles and the linea alba), of bone where ribs and iliac crests may lie, and of the lumps that were detected. The amplitudes of
+all parts but the lumps are found as the mode of their posterior under log-normal priors (Rasmussen and Williams 2006, ch. 5):
+K = K0 + sum_j exp(2 a_j) K_j.
 """
 
 from collections.abc import Sequence
@@ -24,52 +26,53 @@ from palpate_models.numerics.frames import Array
 
 
 class Prior(NamedTuple):
-    """Prior of the field in logarithms, and how its amplitudes are fitted."""
+    """Prior of the field of log force, and limits of the fit of its amplitudes."""
 
-    natural_sd: float = 0.08
-    """Median amplitude of a field: its share of 0.2 over all lengths."""
+    field_sd: float = 0.08
+    """Prior median SD of one field [log force]; six fields give 0.2 in total."""
     bone_sd: float = 0.5
-    """Median amplitude of bone."""
+    """Prior median SD of bone [log force]."""
     level_sd: float = 3.0
     """SD of the patient's own level about the median of the samples."""
-    sure: float = 0.7
-    """SD of the logarithms of the fields' amplitudes about their medians."""
-    unsure: float = 1.2
-    """The same of errors and bone."""
+    field_log_sd: float = 0.7
+    """SD of the log-amplitudes of fields about their prior medians."""
+    error_log_sd: float = 1.2
+    """SD of the log-amplitudes of errors and bone about their prior medians."""
     lump_sd: float = 1.0
     """SD of a lump's log-contrast."""
     free_sd: float = 0.25
-    """SD of its difference from the ideal shape, felt by slides over an abdomen."""
+    """SD of the log-contrast about the ideal shape, for slides over an abdomen."""
     free_press_sd: float = 0.1
-    """The same of presses: a larger one would count a wide lump as rough, and so as improbable."""
+    """SD of the log-contrast about the ideal shape, for presses: a larger one would make a wide lump rough, and so improbable."""
 
     def free(self, standard: PressStandard) -> float:
         """Return the SD of a lump's difference from the ideal shape."""
         return self.free_press_sd if standard.anatomy is None else self.free_sd
 
-    fitted: int = 250
-    """Number of samples for the estimation of amplitudes: of lines that overlap; of presses, each its own stroke, the next."""
-    fitted_presses: int = 800
+    max_fit_samples: int = 250
+    """Maximum number of samples in the fit of the amplitudes, for strokes that overlap."""
+    max_fit_presses: int = 800
+    """Maximum number in that fit of presses, each its own stroke."""
     first_steps: int = 20
-    """Steps from the medians."""
+    """Optimizer steps from the prior medians."""
     steps: int = 6
-    """Steps from earlier values."""
+    """Optimizer steps from the amplitudes of an earlier fit."""
 
 
 PRIOR = Prior()
 KINDS_OF_ERROR = 4
-"""Number of the covariances of `errors`."""
+"""Length of `error_covariances`."""
 
 
-def inverse(triangle: Array) -> Array:
-    """The inverse of a covariance whose lower Cholesky factor is `triangle`, shape (m, m)."""
-    found = np.tril(dpotri(triangle, lower=True)[0])
+def cholesky_inverse(L: Array) -> Array:
+    """Return the inverse of L L^T, where L is a lower Cholesky factor, shape (m, m)."""
+    found = np.tril(dpotri(L, lower=True)[0])
     found += np.tril(found, -1).T
     return np.asarray(found)
 
 
-def natural(a: Array, b: Array, standard: PressStandard) -> list[Array]:
-    """Unit covariances of the fields of natural variation between places a (k, 2) and b (l, 2), each of shape (k, l).
+def field_covariances(a: Array, b: Array, standard: PressStandard) -> list[Array]:
+    """Return unit covariances of the fields of natural variation between places a (k, 2) and b (l, 2), each of shape (k, l).
 
     With an anatomy, the last two are of strips and of bone. Without one, distances count between points of the skin: on a steep
     side of a body, places are further apart than from above.
@@ -85,17 +88,17 @@ def natural(a: Array, b: Array, standard: PressStandard) -> list[Array]:
 
 
 def lump_covariance(lump: Bump, a: Array, b: Array, standard: PressStandard) -> Array:
-    """Prior covariance of a lump's log-contrast between places a (k, 2) and b (l, 2), shape (k, l)."""
+    """Return the prior covariance of a lump's log-contrast between places a (k, 2) and b (l, 2), shape (k, l)."""
     near = 2 * lump.edge
     free = PRIOR.free(standard) ** 2 * np.outer(lump(a, near), lump(b, near)) * smooth(a, b, standard.lengths.free_m)
     return np.asarray(PRIOR.lump_sd**2 * np.outer(lump(a), lump(b)) + free)
 
 
-def errors(o: Observations) -> list[Array]:
-    """Unit covariances of errors whose amplitude is found: stroke zero, breathing [m], zero of force [N], noise [1]; (m, m).
+def error_covariances(o: Observations) -> list[Array]:
+    """Return unit covariances of the fitted errors: stroke zero, breathing [m], zero of force [N], noise [1]; shape (m, m).
 
-    The zero that strokes share counts by one force for all: strokes over soft places are weak, so that by their own forces a soft
-    place would be evidence for a zero, and raise the level.
+    The zero shared by all strokes uses the median 1/F for every sample. With each stroke's own 1/F, low forces over soft tissue
+    would count as evidence for a zero error and raise the level.
     """
     lever, weakness = np.outer(o.per_metre, o.per_metre), np.outer(o.per_newton, o.per_newton)
     breathing = np.exp(-np.abs(o.time[:, None] - o.time) / o.standard.errors.breathing_s)
@@ -120,43 +123,43 @@ def fixed_covariance(o: Observations) -> Array:
     return np.asarray(covariance)
 
 
-def _medians(o: Observations) -> tuple[Array, Array]:
-    """Prior of the log-amplitudes: medians' logarithms and standard deviations."""
+def _log_amplitude_prior(o: Observations) -> tuple[Array, Array]:
+    """Return mean and standard deviation of the prior of the log-amplitudes."""
     e, standard = o.standard.errors, o.standard
-    depth = max(0.5 * float(np.median(o.depth_uncertainty)), e.least_depth_m)
-    fields = [PRIOR.natural_sd] * len(standard.lengths.fields_m)
-    bones = [] if standard.anatomy is None else [PRIOR.natural_sd, PRIOR.bone_sd]
+    depth = max(0.5 * float(np.median(o.depth_uncertainty)), e.min_depth_m)
+    fields = [PRIOR.field_sd] * len(standard.lengths.fields_m)
+    bones = [] if standard.anatomy is None else [PRIOR.field_sd, PRIOR.bone_sd]
     medians = [*fields, *bones, depth, depth, standard.tare_n, e.white_sd]
-    spread = [PRIOR.sure] * len(fields) + [PRIOR.sure, PRIOR.unsure][: len(bones)]
-    return np.log(medians), np.array([*spread, PRIOR.unsure, PRIOR.unsure, PRIOR.sure, PRIOR.unsure])
+    field, error = PRIOR.field_log_sd, PRIOR.error_log_sd
+    return np.log(medians), np.array([field] * len(fields) + [field, error][: len(bones)] + [error, error, field, error])
 
 
-def usual_amplitudes(o: Observations) -> Array:
-    """Log-amplitudes before anything is known of the patient."""
-    return _medians(o)[0]
+def prior_log_amplitudes(o: Observations) -> Array:
+    """Return the prior means of the log-amplitudes."""
+    return _log_amplitude_prior(o)[0]
 
 
-def amplitudes(o: Observations, lumps: Sequence[Bump], start: Array | None = None) -> Array:
-    """Log-amplitudes of the natural fields and the errors under which the data are most likely, given the lumps."""
-    most = PRIOR.fitted_presses if o.standard.anatomy is None else PRIOR.fitted
-    few = o.part(slice(None, None, -(-len(o.y) // most)))
-    parts = np.array(natural(few.xy, few.xy, o.standard) + errors(few))
-    rest = fixed_covariance(few) + sum(lump_covariance(lump, few.xy, few.xy, o.standard) for lump in lumps)
-    middle, spread = _medians(o)
-    y = few.y - np.median(o.y)
+def fit_log_amplitudes(o: Observations, lumps: Sequence[Bump], start: Array | None = None) -> Array:
+    """Return the log-amplitudes of fields and errors at the mode of their posterior, given the lumps."""
+    limit = PRIOR.max_fit_presses if o.standard.anatomy is None else PRIOR.max_fit_samples
+    subset = o.part(slice(None, None, -(-len(o.y) // limit)))
+    parts = np.array(field_covariances(subset.xy, subset.xy, o.standard) + error_covariances(subset))
+    rest = fixed_covariance(subset) + sum(lump_covariance(lump, subset.xy, subset.xy, o.standard) for lump in lumps)
+    mean, sd = _log_amplitude_prior(o)
+    y = subset.y - np.median(o.y)
 
     def loss(a: Array) -> tuple[float, Array]:
         variance = np.exp(2 * a)
-        triangle = cholesky(rest + np.tensordot(variance, parts, 1), lower=True)
-        weights = cho_solve((triangle, True), y)
-        precision = inverse(triangle)
-        difference = (a - middle) / spread
-        value = 0.5 * y @ weights + np.log(np.diag(triangle)).sum() + 0.5 * difference @ difference
-        slope = variance * np.tensordot(parts, precision - np.outer(weights, weights), 2) + difference / spread
+        L = cholesky(rest + np.tensordot(variance, parts, 1), lower=True)
+        weights = cho_solve((L, True), y)
+        precision = cholesky_inverse(L)
+        difference = (a - mean) / sd
+        value = 0.5 * y @ weights + np.log(np.diag(L)).sum() + 0.5 * difference @ difference
+        slope = variance * np.tensordot(parts, precision - np.outer(weights, weights), 2) + difference / sd
         return float(value), slope
 
-    bounds = list(zip(middle - 3 * spread, middle + 3 * spread, strict=True))
-    first, steps = (middle, PRIOR.first_steps) if start is None else (start, PRIOR.steps)
+    bounds = list(zip(mean - 3 * sd, mean + 3 * sd, strict=True))
+    first, steps = (mean, PRIOR.first_steps) if start is None else (start, PRIOR.steps)
     found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
     return np.asarray(found.x)
 
@@ -171,28 +174,29 @@ class Regression:
 
     @cached_property
     def level(self) -> float:
-        """Median of the observations, about which the level is sought."""
+        """Median of the observations; the prior of the level is centred on it."""
         return float(np.median(self.observations.y))
 
     @cached_property
     def transfer_variance(self) -> float:
-        """Variance of the log force of a standard press about the field: of its difference from held presses and slides, or,
-        where presses were felt themselves, of the errors that each press has of its own.
+        """Variance of a standard press's log force about the field [1].
+
+        With an anatomy it is that of the difference from held presses and slides, otherwise that of each press's own errors.
         """
         o, e = self.observations, self.observations.standard.errors
         if o.standard.anatomy is not None:
             return e.press_sd**2 + e.slide_sd**2
-        own = sum(
-            np.exp(2 * size) * np.diag(part) for size, part in zip(self.log_amplitudes[-KINDS_OF_ERROR:], errors(o), strict=True)
-        )
+        fitted = zip(self.log_amplitudes[-KINDS_OF_ERROR:], error_covariances(o), strict=True)
+        own = sum(np.exp(2 * log_amplitude) * np.diag(part) for log_amplitude, part in fitted)
         return float(np.median(own + o.noise**2))
 
     @cached_property
-    def triangle(self) -> Array:
+    def cholesky_factor(self) -> Array:
         """Lower Cholesky factor of the observations' covariance, shape (m, m)."""
         o = self.observations
         covariance = fixed_covariance(o)
-        for log_amplitude, part in zip(self.log_amplitudes, natural(o.xy, o.xy, o.standard) + errors(o), strict=True):
+        parts = field_covariances(o.xy, o.xy, o.standard) + error_covariances(o)
+        for log_amplitude, part in zip(self.log_amplitudes, parts, strict=True):
             covariance += np.exp(2 * log_amplitude) * part
         for lump in self.lumps:
             covariance += lump_covariance(lump, o.xy, o.xy, o.standard)
@@ -205,49 +209,49 @@ class Regression:
 
     @property
     def log_evidence(self) -> float:
-        """Logarithm of the probability density of observations and amplitudes, but for a constant."""
-        middle, spread = _medians(self.observations)
-        off = (self.log_amplitudes - middle) / spread
-        return float(-0.5 * (self.whitened @ self.whitened + off @ off) - np.log(np.diag(self.triangle)).sum())
+        """Log of the joint probability density of observations and log-amplitudes, up to an additive constant."""
+        mean, sd = _log_amplitude_prior(self.observations)
+        off = (self.log_amplitudes - mean) / sd
+        return float(-0.5 * (self.whitened @ self.whitened + off @ off) - np.log(np.diag(self.cholesky_factor)).sum())
 
     def whiten(self, columns: Array) -> Array:
-        """L^-1 times vectors over the samples, shape (m,) or (m, k)."""
-        return np.asarray(solve_triangular(self.triangle, columns, lower=True))
+        """Return L^-1 times vectors over the samples, L the Cholesky factor, shape (m,) or (m, k)."""
+        return np.asarray(solve_triangular(self.cholesky_factor, columns, lower=True))
 
     def healthy_covariance(self, a: Array, b: Array) -> Array:
-        """Covariance of the field without lumps between places, shape (k, l)."""
-        parts = zip(self.log_amplitudes, natural(a, b, self.observations.standard), strict=False)
+        """Return the covariance of the field without lumps between places, shape (k, l)."""
+        parts = zip(self.log_amplitudes, field_covariances(a, b, self.observations.standard), strict=False)
         return np.asarray(PRIOR.level_sd**2 + sum(np.exp(2 * log_amplitude) * part for log_amplitude, part in parts))
 
     def lump_covariance(self, a: Array, b: Array) -> Array:
-        """Covariance of all lumps together between places, shape (k, l)."""
+        """Return the covariance of all lumps together between places, shape (k, l)."""
         covariances = (lump_covariance(lump, a, b, self.observations.standard) for lump in self.lumps)
         return np.asarray(sum(covariances, np.zeros((len(a), len(b)))))
 
     def field(self, xy: Array) -> tuple[Array, Array]:
-        """Posterior mean and standard deviation of z at places [m], shape (k, 2) -> (k,) each."""
+        """Return posterior mean and standard deviation of z at places [m], shape (k, 2) -> (k,) each."""
         o = self.observations
-        seen = self.whiten(self.healthy_covariance(o.xy, xy) + self.lump_covariance(o.xy, xy))
+        whitened_cross = self.whiten(self.healthy_covariance(o.xy, xy) + self.lump_covariance(o.xy, xy))
         anatomy, e = o.standard.anatomy, o.standard.errors
         variances = np.exp(2 * self.log_amplitudes[:-KINDS_OF_ERROR])
         last = 1.0 if anatomy is None else anatomy.bone(xy) ** 2
         prior = PRIOR.level_sd**2 + variances[:-1].sum() + variances[-1] * last
         for lump in self.lumps:
             prior = prior + (PRIOR.lump_sd * lump(xy)) ** 2 + (PRIOR.free(o.standard) * lump(xy, 2 * lump.edge)) ** 2
-        variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.transfer_variance
+        variance = np.maximum(prior - (whitened_cross**2).sum(axis=0), 1e-8) + self.transfer_variance
         if self.lumps and e.lump_press_sd:
             variance += (e.lump_press_sd * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
-        return self.level + self.whitened @ seen, np.sqrt(variance)
+        return self.level + self.whitened @ whitened_cross, np.sqrt(variance)
 
     def smooth(self, xy: Array) -> Array:
-        """Posterior mean of the smooth fields at places [m], shape (k, 2) -> (k,)."""
+        """Return the posterior mean of the smooth fields at places [m], shape (k, 2) -> (k,)."""
         o, lengths = self.observations, self.observations.standard.lengths
         fields = zip(self.log_amplitudes, lengths.fields_m, strict=False)
         parts = [np.exp(2 * size) * smooth(o.xy, xy, length) for size, length in fields if length >= lengths.smooth_m]
         return self.whitened @ self.whiten(np.sum(parts, axis=0))
 
     def contrast(self, lump: Bump, xy: Array) -> tuple[Array, Array]:
-        """Posterior mean (k,) and covariance (k, k) of one lump's log-contrast at places [m], shape (k, 2)."""
+        """Return posterior mean (k,) and covariance (k, k) of one lump's log-contrast at places [m], shape (k, 2)."""
         o = self.observations
-        seen = self.whiten(lump_covariance(lump, o.xy, xy, o.standard))
-        return self.whitened @ seen, lump_covariance(lump, xy, xy, o.standard) - seen.T @ seen
+        whitened_cross = self.whiten(lump_covariance(lump, o.xy, xy, o.standard))
+        return self.whitened @ whitened_cross, lump_covariance(lump, xy, xy, o.standard) - whitened_cross.T @ whitened_cross

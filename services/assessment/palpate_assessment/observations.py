@@ -20,14 +20,14 @@ class Usable(NamedTuple):
     """Samples that are used."""
 
     depth: float = 0.2
-    """Least depth, as a share of the nominal one."""
+    """Minimum depth, as a share of the nominal one."""
     force: float = 0.02
-    """Least force, as a share of the usual one."""
+    """Minimum force, as a share of the usual one."""
     limited_depth: float = 0.6
-    """Least depth of a force-limited sample, as a share of the nominal one: at 6 of 10 mm the exponent of the conversion
+    """Minimum depth of a force-limited sample, as a share of the nominal one: at 6 of 10 mm the exponent of the conversion
     adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
-    fewest: int = 10
-    """Least number of samples."""
+    min_samples: int = 10
+    """Minimum number of samples."""
     neighbours: int = 9
     """Presses, itself among them, whose median is the usual force at a place."""
     slide_mps: float = 0.003
@@ -86,7 +86,7 @@ class Observations:
 
     @cached_property
     def width(self) -> float:
-        """Least width of the convex hull [m]."""
+        """Minimum width of the convex hull [m]."""
         sides = self.hull.equations
         return float(-(self.xy[self.hull.vertices] @ sides[:, :2].T + sides[:, 2]).min(axis=0).max())
 
@@ -127,7 +127,7 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
         )
     ]
     calibration = standard.calibration
-    if len(good) < USABLE.fewest:
+    if len(good) < USABLE.min_samples:
         return None
     position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
     depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])

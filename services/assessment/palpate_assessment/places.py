@@ -14,7 +14,7 @@ from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 
 _GAP: Final = 2.0
-"""Largest circumradius of a triangle of samples without a gap, over their usual distance."""
+"""Maximum circumradius of a triangle of samples without a gap, over their usual distance."""
 
 _NEIGHBOURS: Final = 9
 """Samples, itself among them, whose median is the height of the skin at a place."""
@@ -31,12 +31,12 @@ class SampledPlaces:
 
     @cached_property
     def mesh(self) -> Delaunay:
-        """Triangles between them."""
+        """Triangles between the places."""
         return Delaunay(self.xy)
 
     @cached_property
     def circumradii(self) -> Array:
-        """Of the triangles [m], shape (t,)."""
+        """Circumradii of the triangles [m], shape (t,)."""
         sides = [self.xy[self.mesh.simplices[:, k]] - self.xy[self.mesh.simplices[:, k - 1]] for k in range(3)]
         doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
         return np.asarray(np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30))

@@ -31,7 +31,7 @@ class HeldPress(NamedTuple):
     """Times from then on that are averaged: the standard press is read after 0.4 to 0.5 s, and descends in 0.5 instead of 0.67 s,
     so that the middle of its descent is 0.08 s later."""
     settled_m: float = 0.001
-    """Largest range of depths within these times."""
+    """Maximum range of depths within these times."""
     rise: tuple[float, float] = (0.5, 0.97)
     """Parts of the last depth between which the exponent of the descent is fitted."""
 

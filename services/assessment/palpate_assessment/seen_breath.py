@@ -19,7 +19,7 @@ from palpate_assessment.sampling import ContactState
 from palpate_models.numerics.frames import Array
 
 LONGEST_S: Final = 0.5
-"""Largest gap between images for interpolation [s], and longest wait of a state for the next image."""
+"""Maximum gap between images for interpolation [s], and longest wait of a state for the next image."""
 IMAGES: Final = 40
 """Number of images kept, 4 s."""
 

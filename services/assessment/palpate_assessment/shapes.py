@@ -28,7 +28,7 @@ class Bump(NamedTuple):
     y: float
     """Centre [m]."""
     radius: float
-    """Of a disc, or half the width of a ridge [m]."""
+    """Radius of a disc, or half-width of a ridge [m]."""
     edge: float = LENGTHS.edge_m
     """Standard deviation of its edge [m]."""
     path: tuple[tuple[float, float], ...] = ()

@@ -77,7 +77,7 @@ class ErrorPrior:
 
     breathing_s: float = 1.0
     """Correlation time of residual breathing."""
-    least_depth_m: float = 0.0001
+    min_depth_m: float = 0.0001
     """Prior median of the depth's errors for strokes that claim to have none."""
     surface_m: float = 0.015
     """Correlation length of the surface error that strokes share (without offset and tilt)."""
@@ -108,7 +108,7 @@ class ErrorPrior:
 
 
 ONSET_REFERENCED_ERRORS = ErrorPrior(
-    least_depth_m=0.00003,
+    min_depth_m=0.00003,
     surface_share=0.0,
     wide_share=0.0,
     onset_m=0.0,

@@ -10,7 +10,7 @@ from palpate_assessment.assess import AssessedMap, assess, assess_growing
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import Candidate, Signs, signs
 from palpate_assessment.findings import Kind, causes, marked_share
-from palpate_assessment.model import Regression, amplitudes
+from palpate_assessment.model import Regression, fit_log_amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump
@@ -151,7 +151,7 @@ def seen(samples: list[ForceSample]) -> Signs:
     o = observe(samples, USUAL)
     assert o is not None
     lumps = (Bump(*MIDDLE, 0.03),)
-    return signs(Regression(o, lumps, amplitudes(o, lumps)), lumps[0])
+    return signs(Regression(o, lumps, fit_log_amplitudes(o, lumps)), lumps[0])
 
 
 def letting_go(samples: list[ForceSample]) -> list[ForceSample]:

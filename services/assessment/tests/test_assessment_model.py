@@ -7,7 +7,7 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 from palpate_assessment.assess import AssessedMap, assess, find_contradicted
 from palpate_assessment.detection import find_disc, limit_strength, match_bumps
 from palpate_assessment.grid import map_grid
-from palpate_assessment.model import Regression, amplitudes, usual_amplitudes
+from palpate_assessment.model import Regression, fit_log_amplitudes, prior_log_amplitudes
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump, ridge
@@ -27,14 +27,14 @@ def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observat
 
 @pytest.mark.parametrize("stroke_m", [0.0005, 0.0015])
 def test_errors_of_the_strokes_are_found_from_the_data(stroke_m: float) -> None:
-    found = amplitudes(observed(stroke_m), ())
+    found = fit_log_amplitudes(observed(stroke_m), ())
     assert np.exp(found[len(LENGTHS.fields_m) + 2]) == pytest.approx(stroke_m, rel=0.6)
 
 
 def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() -> None:
     wall = natural(0, 0.15)
     o = observed()
-    regression = Regression(o, (), amplitudes(o, ()))
+    regression = Regression(o, (), fit_log_amplitudes(o, ()))
     mean, sd = regression.field(o.xy)
     assert mean == pytest.approx(LEVEL + wall(o.xy), abs=0.05)
     _, far = regression.field(o.xy + np.array((0.3, 0.0)))
@@ -44,7 +44,7 @@ def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() ->
 def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observations(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002))
-    (log_contrast,), (t,) = match_bumps(Regression(o, (), usual_amplitudes(o)), [bump])
+    (log_contrast,), (t,) = match_bumps(Regression(o, (), prior_log_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
 
@@ -53,7 +53,7 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
 def test_the_edge_with_which_a_lump_is_felt_is_found(edge: float) -> None:
     lump = Bump(0.005, -0.01, 0.02, edge)
     o = observations(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01))
-    found, t = find_disc(Regression(o, (), usual_amplitudes(o)))
+    found, t = find_disc(Regression(o, (), prior_log_amplitudes(o)))
     assert found is not None
     assert found.edge == pytest.approx(edge, rel=0.2)
     assert found.radius == pytest.approx(lump.radius, rel=0.15)
@@ -70,7 +70,7 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     strengths = []
     for samples in (hiccup, lumpy):
         o = observations(samples)
-        regression = Regression(o, (), usual_amplitudes(o))
+        regression = Regression(o, (), prior_log_amplitudes(o))
         (t,) = match_bumps(regression, [bump])[1]
         strengths.append((float(t), limit_strength(regression, bump, float(t))))
     assert strengths[0][1] < 0.5 * strengths[0][0]
@@ -81,7 +81,7 @@ def test_a_lump_in_the_model_takes_its_contrast() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), USUAL)
     assert o is not None
-    regression = Regression(o, (bump,), usual_amplitudes(o))
+    regression = Regression(o, (bump,), prior_log_amplitudes(o))
     mean, covariance = regression.contrast(bump, np.zeros((1, 2)))
     assert np.exp(mean[0]) == pytest.approx(2.0, rel=0.15)
     assert covariance[0, 0] > 0
@@ -94,7 +94,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
     found = []
     for samples in (steady, [s._replace(force=s.force + float(zeros[s.stroke])) for s in steady]):
         o = observations(samples)
-        regression = Regression(o, (), amplitudes(o, ()))
+        regression = Regression(o, (), fit_log_amplitudes(o, ()))
         found.append((np.exp(regression.log_amplitudes[-2]), regression.field(np.zeros((1, 2)))[1][0]))
     (small, sure), (large, unsure) = found
     assert large > 1.3 * small
@@ -103,7 +103,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
 
 def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observations(lines(level))
-    assert not find_contradicted(Regression(o, (), usual_amplitudes(o))).any()
+    assert not find_contradicted(Regression(o, (), prior_log_amplitudes(o))).any()
 
 
 RADIUS, DEPTH, FORCE = 0.006, 0.002, 1.0

@@ -25,7 +25,7 @@ OFF_CENTRE: Final = 0.2
 USUAL_DEPTH_M: Final = (0.05, 20.0)
 """Median depth of an image."""
 LARGEST_DISTORTION: Final = 1e-9
-"""Greatest distortion coefficient of an image that counts as undistorted."""
+"""Maximum distortion coefficient of an image that counts as undistorted."""
 
 
 class CameraError(UserError):

@@ -77,7 +77,7 @@ class Conductor:
         self._encode, self._decode = codec.encoder(CONTROL_TYPE), codec.decoder(REPORT_TYPE)
         self._subscriptions = {role: member.internal_subscription(f"palpate/report/{role}", REPORT_TYPE) for role in roles}
         self._process_roles = {role: (role,) for role in roles}
-        """By role, all roles of its process."""
+        """All roles of a role's process, by role."""
         self._sequence = 0
         self._heartbeat = Heartbeat(member, rules, timing.wallclock)
         self._freezes = FreezeWatch(self._patience)

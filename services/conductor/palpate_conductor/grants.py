@@ -24,7 +24,7 @@ class GrantTuning(NamedTuple):
     """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
     recorder_window_ns: int = NS
     wallclock_lead_ns: int = 200 * MS
-    """From the start message to the common start [ns]."""
+    """Time from the start message to the common start [ns]."""
     regrant_s: float = 0.5
     exam_silent_s: float = 10.0
     """Time without a new exam state after which a wall-clock run ends, since planning would not announce its end."""

@@ -62,7 +62,7 @@ class Patience(NamedTuple):
     frozen: float = 2.5
     """Until the service of a stopped process counts as lost."""
     asleep: float = 15.0
-    """The same for a process that sleeps and uses no processor time; longer than zenoh blocks a sender on a reader that left."""
+    """Until that of a process that sleeps and uses no CPU counts as lost; zenoh blocks a sender on a lost reader for less."""
     pause: float = 3600.0
     """Until a run that an operator has paused ends."""
     absent: tuple[str, ...] = ()
@@ -84,7 +84,7 @@ class RunResult:
     sim_time_s: float = 0.0
     wall_time_s: float = 0.0
     start_time_s: float = 0.0
-    """From the command to the first tick."""
+    """Time from the command to the first tick."""
     blame: dict[str, Any] = field(default_factory=dict)
     """Time of each service by cause."""
     counters: dict[str, Any] = field(default_factory=dict)

@@ -34,21 +34,21 @@ class AdmittanceTuning(NamedTuple):
     yield_s: float = 0.15
     """T. The stiffest wall gives |L| < 1 with any delay."""
     yield_max_m: float = 0.03
-    """Largest y, per axis."""
+    """Maximum |y| per axis."""
     tare_s: float = 0.5
     """Time constant with which the bias of the F/T sensor is learned in free motion."""
     follow_per_s: float = 50.0
     """Gain of the inverse kinematics on the error of pose and of joint positions."""
     posture_per_s: float = 2.0
-    """The same on the posture."""
+    """Gain of the inverse kinematics on the error of the posture."""
     posture_radps: float = 0.5
-    """Largest speed of that."""
+    """Maximum speed of a joint towards the posture."""
     damping_m: float = 0.02
-    """Of the least squares: a motion that moves the tool by less per rad follows the posture instead of the pose."""
+    """Damping of the least squares: a motion that moves the tool by less per rad follows the posture instead of the pose."""
     damping_rad: float = 0.3
-    """The same for turns of the tool [1]: near a singularity it tilts by a few degrees, and its place stays."""
+    """Damping for turns of the tool [1]: near a singularity it tilts by a few degrees, and its place stays."""
     speed_share: float = 0.8
-    """Largest commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
+    """Maximum commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
 
 
 TUNING = AdmittanceTuning()

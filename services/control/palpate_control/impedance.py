@@ -41,7 +41,7 @@ class LawTuning(NamedTuple):
     """Settings of the compiled law, which takes no dataclass."""
 
     position_clip_m: float = 0.1
-    """Largest position error that loads the spring, per axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use similar values)."""
+    """Maximum position error that loads the spring, per axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use similar values)."""
     rotation_clip_rad: float = 0.5
     null_torque_nm: float = 5.0
     """Limit of the null-space torque per joint."""
@@ -49,14 +49,14 @@ class LawTuning(NamedTuple):
     """Damping ratio of the joint springs in mode JOINT and of the null-space posture [1]."""
     stiction_speed_radps: float = 0.02
     """Joint speed at which half of the Coulomb friction is compensated. Keeps the compensation smooth."""
-    least_damping: float = 0.1
+    min_damping: float = 0.1
     """Fraction of the designed damping that is always commanded [1]: the friction estimate is poor."""
     regularisation: float = 1e-7
     """Added to the diagonal of a task mobility [1/kg, 1/(kg m^2)], which loses rank where the arm is singular."""
     slow_s: float = 0.1
     """T: time scale on which friction and inertia matter equally. Postures and scans move this slowly or slower."""
     spring_angle_rad: float = 0.3
-    """Largest undamped spring frequency times the dead time. Above it sampled damping adds energy."""
+    """Maximum undamped spring frequency times the dead time. Above it sampled damping adds energy."""
 
 
 LAW = LawTuning()
@@ -66,7 +66,7 @@ class ControllerTuning(NamedTuple):
     """Settings of the controller outside the compiled law."""
 
     joint_clip_rad: float = 0.25
-    """Largest joint error that loads the spring in mode JOINT."""
+    """Maximum joint error that loads the spring in mode JOINT."""
     dead_ticks: int = 2
     """Delay from measurement to torque: one tick of transport, half a tick of zero-order hold, half a tick of velocity age."""
     design_ticks: int = 10
@@ -244,7 +244,7 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     B = 2 * damping_ratio * np.sqrt(K * mass)
     B_0 = 2 * LAW.joint_damping_ratio * np.sqrt(K_0 / np.diag(M_inverse))
     J_bar = W @ J.T @ slow_inertia @ turn
-    return CartesianGains(K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar)
+    return CartesianGains(K, np.maximum(B - friction, LAW.min_damping * B), K_0, B_0, J_bar)
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
@@ -256,4 +256,4 @@ def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: 
     friction = P_inverse**2 @ viscous_friction
     squared = np.clip(squared, 0.0, np.maximum((LAW.spring_angle_rad / dead_time) ** 2, friction / (4 * dead_time)))
     damping = 2 * LAW.joint_damping_ratio * np.sqrt(squared)
-    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LAW.least_damping * damping)) @ P.T)
+    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LAW.min_damping * damping)) @ P.T)

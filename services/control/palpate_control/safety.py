@@ -6,7 +6,7 @@ from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 
 TORQUE_RATE_NM_PER_MS = 1.0
-"""Largest change of a joint's torque in one millisecond [N m] (libfranka and CRISP bound it to 0.5 to 1.0)."""
+"""Maximum change of a joint's torque in one millisecond [N m] (libfranka and CRISP bound it to 0.5 to 1.0)."""
 REPULSION_FRACTION = 0.3
 """Repulsion at a joint limit, as a fraction of the joint's torque limit."""
 

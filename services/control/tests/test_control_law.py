@@ -162,7 +162,7 @@ def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: 
     b = (np.diag(np.linalg.inv(X @ J @ W @ J.T @ X.T)) - m) / impedance.LAW.slow_s
     m = np.minimum(m, 4 / np.diag(X @ J @ np.linalg.inv(M) @ J.T @ X.T))
     designed = 2 * asked.damping_ratio * np.sqrt(asked.stiffness * m)
-    B = np.maximum(designed - b, impedance.LAW.least_damping * designed)
+    B = np.maximum(designed - b, impedance.LAW.min_damping * designed)
     B_0 = 2 * impedance.LAW.joint_damping_ratio * np.sqrt(asked.joint_stiffness / np.diag(np.linalg.inv(M)))
     tau_0 = asked.joint_stiffness * (asked.q - q) + B_0 * (qd_0 - qd)
     qd_d = qd_0 + J_bar @ (twist - J @ qd_0)

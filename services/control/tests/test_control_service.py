@@ -173,7 +173,7 @@ def moving(t: int) -> np.ndarray:
 
 
 def peak_on_the_way(delay: int, *, lagging: bool = False) -> float:
-    """Largest torque of joint 1 [N m] while the arm moves as it should and its states arrive `delay` [ns] late after 100 ms.
+    """Maximum torque of joint 1 [N m] while the arm moves as it should and its states arrive `delay` [ns] late after 100 ms.
 
     They stay away while they would be older than 15 ms. A `lagging` arm takes two ticks for one from then on.
     """

@@ -23,8 +23,8 @@ class BreathTuning(NamedTuple):
 
     rates_per_min: tuple[float, float] = (4.0, 40.0)
     """Range of breathing rates."""
-    least_s: float = 5.0
-    """Least history for an estimate of rate and amplitude [s]."""
+    min_history_s: float = 5.0
+    """Minimum history for an estimate of rate and amplitude [s]."""
     memory_s: float = 30.0
     """History from which rate and amplitude are estimated [s]."""
     renewal_s: float = 1.0
@@ -34,8 +34,8 @@ class BreathTuning(NamedTuple):
     """Time constant T_0 of the level."""
     shares: tuple[float, float, float] = (0.5, 0.5, 0.125)
     """SDs of level and oscillators, relative to the peak-to-peak amplitude."""
-    least_m: float = 2e-4
-    """Least amplitude; a wall that moves less is still, and the forecast is the level."""
+    min_m: float = 2e-4
+    """Minimum amplitude; a wall that moves less is still, and the forecast is the level."""
 
 
 TUNING: Final = BreathTuning()
@@ -57,7 +57,7 @@ class BreathFilter:
         self._P = self._stationary
         for t, value in zip(t_s, d, strict=True):
             self.forward(float(t))
-            self.update(float(value), TUNING.least_m)
+            self.update(float(value), TUNING.min_m)
 
     def forward(self, t_s: float) -> tuple[float, float]:
         """Predict to time `t_s` [s]; return the expected displacement and its SD [m]."""
@@ -82,7 +82,7 @@ class BreathFilter:
             while self._times[0] < self._t_s - TUNING.memory_s:
                 del self._times[0], self._seen[0]
             self._renewed_s = self._t_s
-            if self._times[-1] - self._times[0] >= TUNING.least_s:  # otherwise the wall was hidden for long: keep the estimates
+            if self._times[-1] - self._times[0] >= TUNING.min_history_s:  # else the wall was long hidden: keep the estimates
                 self._learn()
 
     def forget(self, d: float) -> None:
@@ -104,7 +104,7 @@ class BreathFilter:
         mean = float(d.mean())
         self._x[0] += self._mean - mean
         self._mean = mean
-        self.depth = max(float(2 * np.sqrt(2) * d.std()), TUNING.least_m)
+        self.depth = max(float(2 * np.sqrt(2) * d.std()), TUNING.min_m)
         """Mean peak-to-peak depth of the breaths [m]: that of a sine of equal variance."""
         self._rate = 2 * np.pi / 60 * strongest_rate(t, d - mean)
         scale = self.depth * np.array((TUNING.shares[0], TUNING.shares[1], TUNING.shares[1], TUNING.shares[2], TUNING.shares[2]))

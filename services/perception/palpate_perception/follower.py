@@ -107,8 +107,8 @@ class DriftTuning(NamedTuple):
     """Distance from the table's top within which a point belongs to the table: the calibration has errors of centimetres."""
     tau_s: float = 10.0
     """Time constant of the drift [s]: errors shared by neighbouring pixels last for seconds, warming up for minutes."""
-    least_pixels: int = 50
-    """Least number of table pixels in view; with fewer the drift estimate is kept."""
+    min_pixels: int = 50
+    """Minimum number of table pixels in view; with fewer the drift estimate is kept."""
 
 
 DRIFT: Final = DriftTuning()
@@ -137,7 +137,7 @@ class CameraDrift:
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> float:
         """Return the drift [m] after an image exposed at `t_s` [s]: depths [m] and mask of hidden pixels, (n,) each."""
         seen = np.isfinite(depth) & ~hidden
-        if np.count_nonzero(seen) >= DRIFT.least_pixels:
+        if np.count_nonzero(seen) >= DRIFT.min_pixels:
             now = float(np.median((depth - self.depth)[seen]))
             self.drift += (1 - np.exp((self._last_s - t_s) / DRIFT.tau_s)) * (now - self.drift)
         self._last_s = t_s

@@ -28,10 +28,10 @@ class PipelineTuning(NamedTuple):
     mesh_step_m: float = 0.005
     motion_m: float = 5e-4
     """SD of the surface over the frames above which a remark is added; noise causes less than a tenth of it."""
-    least_coverage: float = 0.95
-    """Least part of the region in view; below it no targets are returned."""
-    least_agreeing: float = 0.5
-    """Least share of depths near their median over the frames; a live camera has nearly all of them there."""
+    min_coverage: float = 0.95
+    """Minimum part of the region in view; below it no targets are returned."""
+    min_agreeing: float = 0.5
+    """Minimum share of depths near their median over the frames; a live camera has nearly all of them there."""
 
 
 PIPELINE: Final = PipelineTuning()
@@ -128,15 +128,15 @@ class Pipeline:
         def failed(reason: ViewReason, message: str) -> Perceived:
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, reason, message)
 
-        if fused.agreeing < PIPELINE.least_agreeing:
+        if fused.agreeing < PIPELINE.min_agreeing:
             differing = f"{100 * (1 - fused.agreeing):.0f} % of the depths"
             message = f"{differing} differ from frame to frame by more than {cloud.GATE:g} times the camera's noise"
             return failed(ViewReason.BAD_FRAMES, message)
 
-        if coverage < PIPELINE.least_coverage:
+        if coverage < PIPELINE.min_coverage:
             gaps = self._gaps(seen, p_A, depth, origin, camera)
             part = f"{100 * coverage:.0f} % of the region of interest seen"
-            return failed(gaps.reason, f"{part}, {100 * PIPELINE.least_coverage:.0f} % needed: {gaps}")
+            return failed(gaps.reason, f"{part}, {100 * PIPELINE.min_coverage:.0f} % needed: {gaps}")
 
         if (away := float(np.abs(shift).max())) > PIPELINE.margin_m:  # outside the cropped and fitted area
             message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * PIPELINE.margin_m:.0f} mm)"

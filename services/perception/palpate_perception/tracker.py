@@ -85,9 +85,9 @@ def shift_between(before: WallPixels, after: WallPixels, middle: Array, drift: f
 class AverageTuning(NamedTuple):
     """Tuning of the surface correction from the mean of all small images."""
 
-    least_images: int = 30
-    """Least number of images of a pixel."""
-    least_pixels: int = 12
+    min_images: int = 30
+    """Minimum number of images of a pixel."""
+    min_pixels: int = 12
     """Fewer pixels over the surface correct nothing."""
     pixel_error_m: float = 2e-4
     """Error of a pixel's mean [m] (assumed); uniform, so it does not change weights."""
@@ -116,8 +116,8 @@ class WallAverage:
         z = wall.depth + wall.gain * self._sum / self._images
         x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T
         low, high = ((getattr(field.x, end), getattr(field.y, end)) for end in ("low", "high"))
-        over = (self._images >= AVERAGE.least_images) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
-        if np.count_nonzero(over) < AVERAGE.least_pixels:
+        over = (self._images >= AVERAGE.min_images) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        if np.count_nonzero(over) < AVERAGE.min_pixels:
             return None
         x, y, height = x[over], y[over], height[over]
         outward = (height - field.height(x, y)) * field.normal(x, y)[:, 2]
@@ -138,21 +138,21 @@ class TrackerTuning(NamedTuple):
     shared_error_tau_s: float = 20.0
     """Time constant of the estimate of that SD [s]."""
     reach_m: float = 0.06
-    """Largest distance of a wall pixel from the expected wall [m]."""
+    """Maximum distance of a wall pixel from the expected wall [m]."""
     tukey: float = 5.0
     """Tukey's biweight, in standard deviations of a pixel."""
-    least_share: float = 0.015
-    """Least share of the wall's weight in view; below it the wall is lost."""
+    min_share: float = 0.015
+    """Minimum share of the wall's weight in view; below it the wall is lost."""
     surprise: float = 5.0
     """Innovation, in standard deviations, from which a displacement is not a normal breath."""
     surprise_m: float = 2.5e-3
-    """Least innovation of such a displacement [m]."""
+    """Minimum innovation of such a displacement [m]."""
     deep: float = 2.2
     """Depth of a deep breath, as a multiple of the usual depth."""
     calm_s: float = 0.6
     """Time after the last surprise until the wall is quiet again [s]."""
     gap_s: float = 0.2
-    """Largest time that one image represents, also after a gap in which the patient may have moved [s]."""
+    """Maximum time that one image represents, also after a gap in which the patient may have moved [s]."""
 
 
 TRACKING: Final = TrackerTuning()
@@ -166,8 +166,8 @@ class PatientMotionTuning(NamedTuple):
 
     It averages about six images. White noise falls by that to the level of the errors shared by neighbouring pixels, which do not
     fall, so the average is about as accurate as the white noise of one image."""
-    least_m: float = 0.002
-    """Least patient motion [m]: root mean square over the region's corners, without a common rise."""
+    min_m: float = 0.002
+    """Minimum patient motion [m]: root mean square over the region's corners, without a common rise."""
     threshold: float = 14.0
     """Motion is detected when its squared Mahalanobis distance exceeds this multiple of the running mean.
 
@@ -247,7 +247,7 @@ class Tracker:
         use = np.isfinite(depth) & ~hidden & (np.abs(y - self.wall.lifts * expected) < TRACKING.reach_m)
         y = np.where(use, y, 0.0)
         weight = np.where(use, self._certainty, 0.0)
-        if float(weight @ self.wall.lifts**2) < TRACKING.least_share * self._whole:
+        if float(weight @ self.wall.lifts**2) < TRACKING.min_share * self._whole:
             return self._result(State.MOVED if self.moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         if not weight.any():
@@ -304,7 +304,7 @@ class Tracker:
         weighted = weight[:, np.newaxis] * self._reasons
         self._precision = MOTION.memory * self._precision + (1 - MOTION.memory) * self._reasons.T @ weighted
         self._pull = MOTION.memory * self._pull + (1 - MOTION.memory) * weighted.T @ left
-        moving = self.moved_by > MOTION.least_m and self.evidence > MOTION.threshold * self._usual
+        moving = self.moved_by > MOTION.min_m and self.evidence > MOTION.threshold * self._usual
         self._votes = self._votes + 1 if moving else 0
         if not self._votes and not self.moved:
             evidence = min(self.evidence, MOTION.mean_clip * self._usual)

@@ -19,7 +19,7 @@ class VisibilityTuning(NamedTuple):
     clearance_m: float = 0.025
     """Distance from the expected surface above which a nearer point hides it and a farther one is not the abdomen."""
     crest_m: float = 0.03
-    """Largest height of the abdomen in A, whose origin is the umbilicus [m]."""
+    """Maximum height of the abdomen in A, whose origin is the umbilicus [m]."""
 
 
 TUNING: Final = VisibilityTuning()
@@ -96,7 +96,7 @@ class Gaps(NamedTuple):
     shares: dict[ViewReason, float]
     """Fraction of the region, largest first, without those of at most half a percent."""
     obstacle_m: float
-    """Largest distance of an obstacle from the surface behind it [m]."""
+    """Maximum distance of an obstacle from the surface behind it [m]."""
 
     @property
     def reason(self) -> ViewReason:

@@ -29,7 +29,7 @@ class WallFitTuning(NamedTuple):
     margin_m: float = 0.12
     """Margin of the tracked area around the region [m]; it distinguishes a shift from a breath."""
     half_m: float = 0.22
-    """Least half width of the tracked area [m]."""
+    """Minimum half width of the tracked area [m]."""
     cutoff_m: float = 0.06
     """Cut-off wavelength of the wall's surface [m]; the pixels are 14 mm apart."""
     degree: int = 4
@@ -37,16 +37,16 @@ class WallFitTuning(NamedTuple):
     unknown_noise_m: float = 2e-3
     """Noise of a pixel without an estimate [m]."""
     valid_share: float = 0.7
-    """Least fraction of the frames in which a pixel must be valid."""
-    least_cosine: float = 0.35
-    """Least cosine between ray and normal; below it a small lateral error causes a large depth error."""
+    """Minimum fraction of the frames in which a pixel must be valid."""
+    min_cosine: float = 0.35
+    """Minimum cosine between ray and normal; below it a small lateral error causes a large depth error."""
     edge_noise: float = 2.5
     """Noise, as a multiple of the median, above which a pixel counts as an edge and is excluded."""
     still_m: float = 3e-4
     """SD of the displacement below which the wall is still [m]; then the mode is uniform."""
     expired_share: float = 0.05
     """Quantile of the displacement that is taken as the end of expiration; noise makes lower values."""
-    least_pixels: int = 60
+    min_pixels: int = 60
 
 
 WALL_FIT: Final = WallFitTuning()
@@ -138,7 +138,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], WALL_FIT.cutoff_m)
     n_A = field.normal(p_A[:, 0], p_A[:, 1])
     slope = np.einsum("ij,ij->i", n_A, r_C @ X_AC[:3, :3].T)
-    keep &= -slope > WALL_FIT.least_cosine * np.linalg.norm(r_C, axis=1)
+    keep &= -slope > WALL_FIT.min_cosine * np.linalg.norm(r_C, axis=1)
     _check_count(keep, "show the wall at a usable angle")
     pixel, gain = pixel[keep], 1 / slope[keep]
     mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
@@ -159,8 +159,8 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
 
 def _check_count(keep: NDArray[np.bool_], what: str) -> None:
     """Raise WallNotVisibleError if too few pixels are kept."""
-    if (count := np.count_nonzero(keep)) < WALL_FIT.least_pixels:
-        raise WallNotVisibleError(f"{count} pixels of the small image {what}, want {WALL_FIT.least_pixels}")
+    if (count := np.count_nonzero(keep)) < WALL_FIT.min_pixels:
+        raise WallNotVisibleError(f"{count} pixels of the small image {what}, want {WALL_FIT.min_pixels}")
 
 
 def find_steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:

@@ -56,7 +56,7 @@ def test_frames_that_looked_past_an_edge_are_left_out() -> None:
 def test_frames_of_a_camera_that_only_sends_noise_do_not_agree(noise_m: float, usable: bool) -> None:
     rng = np.random.default_rng(2)
     images = [image + np.float32(noise_m) * rng.standard_normal(SHAPE, np.float32) for image in frames(np.full(SHAPE, 1.1), 10)]
-    assert (fuse(images).fused().agreeing > PIPELINE.least_agreeing) == usable
+    assert (fuse(images).fused().agreeing > PIPELINE.min_agreeing) == usable
 
 
 def test_invalid_pixels_do_not_count_and_never_valid_ones_stay_invalid() -> None:

@@ -63,7 +63,7 @@ class ContactThresholds(NamedTuple):
     off_n: float = 0.15
     """Contact ends below this normal force."""
     joints_n: float = 3.0
-    """Largest error of the force by the joints: beyond it they feel a contact."""
+    """Maximum error of the force by the joints: beyond it they feel a contact."""
 
 
 THRESHOLDS = ContactThresholds()

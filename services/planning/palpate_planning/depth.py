@@ -47,7 +47,7 @@ class DepthTuning(NamedTuple):
     model_depth_m: float = 0.003
     """Below this depth the power law is replaced by the force at this depth."""
     rate_max_mps: float = 0.2
-    """Greatest rate of the commanded depth that control may extrapolate by."""
+    """Maximum rate of the commanded depth that control may extrapolate by."""
     limited_m: float = 0.0002
     """Yielding by more than this is reported."""
 

@@ -47,7 +47,7 @@ class ExamTuning(NamedTuple):
     """Simulated time that planning the examination takes."""
     findings_timeout_ns: int = 120 * SECOND
     lost_fraction_max: float = 0.1
-    """With more of the targets lost to faults the examination counts as failed."""
+    """Maximum share of targets lost to faults; with more the examination counts as failed."""
 
 
 EXAM = ExamTuning()

@@ -28,12 +28,12 @@ class WallTuning(NamedTuple):
     hidden_timeout_s: float = 5.0
     """The arm leaves if it hides the wall for this time; a deep breath or a cough, which also hides it, is shorter."""
     contact_lost_s: float = 0.3
-    """Without contact at depth for this time the wall is touched again."""
+    """Maximum time without contact at depth; then the wall is touched again."""
     contact_losses_max: int = 5
     gate_closed_max_s: float = 15.0
-    """With gated breathing the arm lifts if the end of expiration is not reached for this time."""
+    """Maximum time without an end of expiration with gated breathing; then the arm lifts."""
     gate_m: float = 0.001
-    """With gated breathing, samples count up to this distance from the end of expiration, where the wall moves most."""
+    """Maximum displacement of a counted sample from the end of expiration with gated breathing, where the wall moves most."""
 
 
 class RecoveryTuning(NamedTuple):
@@ -60,7 +60,7 @@ class SurgeTuning(NamedTuple):
 
     over: int = 3
     """Periods over which the rate is measured."""
-    least_nps: float = 60.0
+    min_nps: float = 60.0
     """Twice the rate in the fastest descent into a stiff wall."""
     ahead_s: float = 0.1
     """The arm retreats if the force would pass its working limit within this time: a cough lifts the wall for as long."""
@@ -82,7 +82,7 @@ class ForceWatch:
         """Return the force [N] in `SURGE.ahead_s` if it rises suddenly, else the present one."""
         self._loads.append(load)
         rate = (load - self._loads[0]) / (SURGE.over * self._period_s)
-        return load + rate * SURGE.ahead_s if rate > SURGE.least_nps else load
+        return load + rate * SURGE.ahead_s if rate > SURGE.min_nps else load
 
 
 class WallWatch:

@@ -124,4 +124,4 @@ class ExamStep:
     touched: PublishedTouch | None = None
     """The touch of this step, if there was one."""
     correction: tuple[Array, Array] | None = None
-    """Of the perceived surface's vertices, as by `Wall.corrected`, once: when the strokes are over."""
+    """Correction of the perceived surface's vertices, from `Wall.corrected`, once: when the strokes are over."""

@@ -22,7 +22,7 @@ class StrokeTuning(NamedTuple):
     """Tolerances, times and heights of a stroke."""
 
     hop_height_m: float = 0.010
-    """Least height between strokes; it is `SEGMENTS.hover_m` on free motions and where the wall is uncertain."""
+    """Minimum height between strokes; it is `SEGMENTS.hover_m` on free motions and where the wall is uncertain."""
     lift_mps: float = 0.12
     settled_error_m: float = 0.0005
     """An indentation has settled when its depth error stays below this for `settled_s`, or after `settle_timeout_s`."""
@@ -168,8 +168,8 @@ def _descend(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
 def _settle(motion: StrokeMotion) -> Stages[None]:
     """Wait until the depth error is small; before a slide also for the hold of a standard press."""
     settled, waited = Duration(motion.period_s), Duration(motion.period_s)
-    least_s = STROKE.press_s if motion.segment.path.length > 0 else 0.0
-    while waited.s < least_s or (settled.s < STROKE.settled_s and waited.s < STROKE.settle_timeout_s):
+    min_s = STROKE.press_s if motion.segment.path.length > 0 else 0.0
+    while waited.s < min_s or (settled.s < STROKE.settled_s and waited.s < STROKE.settle_timeout_s):
         now = yield StrokeStage.SETTLE
         motion.deepen()
         settled.update(abs(motion.regulation.reference - now.contact.depth) < STROKE.settled_error_m)

@@ -30,14 +30,14 @@ class MotionTuning(NamedTuple):
     """Speed between strokes."""
     transfer_acceleration_mps2: float = 0.8
     creep_mps: float = 1e-3
-    """Least speed along a path."""
+    """Minimum speed along a path."""
     end_tolerance_m: float = 1e-4
     braking_fraction: float = 0.75
     """Fraction of the acceleration with which the motion along a path brakes."""
     behind_rad: float = 0.1
     """A free motion has arrived when no joint is this far behind: a real arm may be slowed down by its own controller."""
     posture_radps: float = 10.0
-    """Greatest speed of the posture in set-points of contact: near a singular wrist, that at the end of a path and that at the
+    """Maximum speed of the posture in set-points of contact: near a singular wrist, that at the end of a path and that at the
     start of the next stroke are far apart."""
     stopped_speed_fraction: float = 0.1
     """Below this fraction of its speed the descent counts as stopped by force."""
@@ -104,7 +104,7 @@ class StrokeMotion:
         self._following = True
         """False while a free motion pauses."""
         self._behind_rad = 0.0
-        """Largest distance of a joint from a free motion."""
+        """Maximum distance of a joint from a free motion."""
         self._q_offset: Array | None = None
         """Measured less planned joint positions at the start of a free motion [rad], shape (n,); None until then."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m

@@ -42,7 +42,7 @@ class Remainder:
     wanted: frozenset[int] | None = None
     """Targets to examine; None: all."""
     bend: float | None = None
-    """Least bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
+    """Minimum bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
     rescans: int = 0
     """Number of new views because the patient moved, or no tissue was felt."""
     looked_again: bool = False

@@ -20,7 +20,7 @@ class BagSizes(NamedTuple):
     """Sizes of chunks and files."""
 
     chunk_bytes: int = 4 * 1024 * 1024
-    """Largest size of a chunk, which bounds the memory."""
+    """Maximum size of a chunk, which bounds the memory."""
     flush_ns: int = 1_000_000_000
     """Simulated time after which a chunk goes to disk [ns]."""
     file_bytes: int = 1 << 30

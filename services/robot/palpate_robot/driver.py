@@ -25,13 +25,13 @@ class DriverTuning(NamedTuple):
     brake_ticks: int = 100
     """Duration of that phase [ms]: much longer than stopping takes, and a small part of a breath."""
     torque_rate_nm_per_ms: float = 2.0
-    """Largest change of a joint command. libfranka aborts beyond 1; our controller keeps to 1. A corrupted command rarely
+    """Maximum change of a joint command. libfranka aborts beyond 1; our controller keeps to 1. A corrupted command rarely
     passes."""
     position_jump_rad: float = 0.02
-    """Largest change of a joint position command beyond that at the speed limit, and largest distance of the first one from the
+    """Maximum change of a joint position command beyond that at the speed limit, and largest distance of the first one from the
     measured position (assumed)."""
     first_torque_nm: float = 20.0
-    """Largest first command per joint (assumed): the arm is at rest, and a set-point at its position needs almost no torque."""
+    """Maximum first command per joint (assumed): the arm is at rest, and a set-point at its position needs almost no torque."""
     validity_ns: int = 50_000_000
     """Longest validity of a command, as in the contract, and longest interval counted since the previous one."""
     ahead_ns: int = 500_000_000

@@ -26,7 +26,7 @@ class PositionLoopTuning(NamedTuple):
     settling_s: float = 0.02
     """d / k: time constant with which an error of position decays."""
     latency_s: float = 0.010
-    """From a command to the motion that it begins."""
+    """Delay from a command to the start of its motion."""
     reference_radps: float = 100.0
     """Frequency of the reference."""
     acceleration_factor: float = 2.0

@@ -28,7 +28,7 @@ _STATUS_PERIOD = contract().topics["robot/status"].period
 _LINKS_PERIOD = contract().topics["sim/link_poses"].period
 _CONTACT_AGE = contract().topics["sim/contact_wrench"].max_age
 _MOST_STEPS = 50
-"""Largest number of plant steps in one tick, after an overrun in wall-clock mode."""
+"""Maximum number of plant steps in one tick, after an overrun in wall-clock mode."""
 
 
 class RobotService(Service):
@@ -78,7 +78,7 @@ class RobotService(Service):
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """Same as `step`, in the order in which control and tissue wait for the messages."""
+        """Do what `step` does, in the order in which control and tissue wait for the messages."""
         self._stop_requests.apply(t, inbox)
         self._drive(t, inbox)
         stamp = Time(t // NS, t % NS)

@@ -240,7 +240,7 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
         force, damping = rng.normal(size=3), np.full(7, 3.0)
         quick.step(torque, force, NOTHING, damping)
         thorough.step(torque, force, NOTHING, damping)
-        free += quick._free_travel > CLEARANCE.least_rad
+        free += quick._free_travel > CLEARANCE.min_rad
         touched = touched or thorough.contacts() > 0
         assert quick.contacts() == thorough.contacts()
         np.testing.assert_array_equal(quick.q, thorough.q)

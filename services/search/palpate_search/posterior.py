@@ -22,7 +22,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
 from palpate_assessment.calibration import load_calibration
-from palpate_assessment.model import lump_covariance, natural
+from palpate_assessment.model import field_covariances, lump_covariance
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, USUAL
 from palpate_models.numerics.frames import Array
@@ -62,7 +62,7 @@ class FieldPrior(NamedTuple):
     """Natural variation of the log-force, and errors of the depth."""
 
     natural_sd: tuple[float, float, float, float, float, float] = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
-    """Amplitudes of the fields of natural variation, strips last (`palpate_assessment.model.natural`)."""
+    """Amplitudes of the fields of natural variation, strips last (`palpate_assessment.model.field_covariances`)."""
     bone_sd: float = 0.27
     """Amplitude of bone."""
     variation_scales: tuple[float, float] = (0.75, 1.3)
@@ -201,7 +201,7 @@ class Posterior:
     def add(self, felt: Press) -> None:
         """Update the posterior with a press."""
         calibration = load_calibration()
-        depth, force = max(felt.depth, PRESSES.least_measured_m), max(felt.force, 0.1)
+        depth, force = max(felt.depth, PRESSES.min_measured_m), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
         xy, n = felt.xy[None], len(self.presses)
@@ -267,7 +267,7 @@ class Posterior:
 
     def _natural(self, a: Array, b: Array) -> Array:
         """Return the covariance of the field without a lump under each model, shape (models, k, l)."""
-        parts = np.array(natural(a, b, USUAL))
+        parts = np.array(field_covariances(a, b, USUAL))
         known = sum((lump_covariance(bump, a, b, USUAL) for bump in self.accepted), np.zeros((len(a), len(b))))
         return np.asarray(LEVEL_SD**2 + np.tensordot(self._parts, parts, 1) + known)
 

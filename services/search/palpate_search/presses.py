@@ -18,9 +18,9 @@ class PressTuning(NamedTuple):
     places_m: float = 0.010
     """Spacing of candidate places."""
     border_m: float = 0.010
-    """Least distance of presses from the region's edge: reach and surface are known only inside."""
-    least_measured_m: float = 0.002
-    """Least measured depth that methods use: a measured depth may be zero, and its logarithm is taken."""
+    """Minimum distance of presses from the region's edge: reach and surface are known only inside."""
+    min_measured_m: float = 0.002
+    """Minimum measured depth that methods use: a measured depth may be zero, and its logarithm is taken."""
     shallowest_ratio: float = 0.6
     """Depth of the shallowest press, as a multiple of the nominal depth."""
     deepest_ratio: float = 1.4
@@ -81,7 +81,7 @@ class Task:
     depth: float = 0.010
     """Nominal depth of a press [m]."""
     deepest: float = 0.014
-    """Greatest depth of a press [m]."""
+    """Maximum depth of a press [m]."""
     force: float = 15.0
     """Force limit of a press [N]."""
     depth_uncertainty: float = 0.001
@@ -93,7 +93,7 @@ class Task:
 
     @property
     def shallowest(self) -> float:
-        """Least depth of a press [m]."""
+        """Minimum depth of a press [m]."""
         return PRESSES.shallowest_ratio * self.depth
 
     @classmethod
@@ -112,12 +112,12 @@ class Task:
 
     @cached_property
     def low(self) -> Array:
-        """Least x and y of a press [m], shape (2,)."""
+        """Minimum x and y of a press [m], shape (2,)."""
         return np.array(self.centre) - self._half
 
     @cached_property
     def high(self) -> Array:
-        """Greatest x and y of a press [m], shape (2,)."""
+        """Maximum x and y of a press [m], shape (2,)."""
         return np.array(self.centre) + self._half
 
     @property

@@ -26,15 +26,15 @@ PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, Exam
 class SearchTuning(NamedTuple):
     """Numbers of presses, and tolerances."""
 
-    least_uncertainty_m: float = 0.0002
+    min_uncertainty_m: float = 0.0002
     """Lower bound of the depth SD."""
     reached_m: float = 0.005
     """A requested place counts as out of reach if no press came nearer than this."""
     outline_presses: int = 6
     """Presses around a lump that was found."""
     rounded_m: float = 1e-9
-    fewest_presses: int = 12
-    """Least number of presses: with fewer the assessment has no result."""
+    min_presses: int = 12
+    """Minimum number of presses: with fewer the assessment has no result."""
 
 
 TUNING = SearchTuning()
@@ -116,7 +116,7 @@ class SearchService(Service):
     def _over(self) -> str:
         """Return the reason for the end; empty while the search continues."""
         posterior, left = self._posterior, self._posterior.left(self._spent_s)
-        if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= TUNING.fewest_presses:
+        if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= TUNING.min_presses:
             return f"the probability of a missed lump is {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
             return f"{posterior.task.budget.presses} presses made"
@@ -167,7 +167,7 @@ def outline(lump: Bump, posterior: Posterior) -> list[Array]:
 
 def _press(sample: Message) -> Press:
     x, y, t = sample.position.x, sample.position.y, nanoseconds(sample.header.stamp) / NS
-    sd, stroke = max(sample.depth_uncertainty, TUNING.least_uncertainty_m), int(sample.stroke)
+    sd, stroke = max(sample.depth_uncertainty, TUNING.min_uncertainty_m), int(sample.stroke)
     limited = sample.force_limited
     return Press(x, y, sample.depth, sample.normal_force, t, limited=limited, depth_uncertainty=sd, stroke=stroke)
 

@@ -216,7 +216,7 @@ def test_it_finds_the_stiff_area_and_ends() -> None:
     requests = [item.message for item in rig.log[REQUEST]]
     assert requests[-1].request == SearchRequest.DONE
     assert requests[-1].lump < Search().missed
-    assert TUNING.fewest_presses < len(requests) < 40
+    assert TUNING.min_presses < len(requests) < 40
     places = np.array([(message.place.x, message.place.y) for message in requests[:-1]])
     assert (np.linalg.norm(places - 0.02, axis=1) < 0.025).sum() >= 3
 

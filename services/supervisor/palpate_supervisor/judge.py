@@ -15,7 +15,7 @@ class JudgeTuning(NamedTuple):
     """Limits of the comparison. `research/senses.py` has the largest values of undisturbed examinations."""
 
     disagreement_sd: float = 3.5
-    """In standard deviations of the force by the joints in the direction that they feel least (LBR at the abdomen: 1.0 N)."""
+    """Limit of the disagreement, in SDs of the joints' force in its least certain direction (LBR at the abdomen: 1.0 N)."""
     disagreement_n: tuple[float, float] = (3.0, 6.0)
     """Bounds of that limit."""
     disagreements: int = 5
@@ -27,9 +27,9 @@ class JudgeTuning(NamedTuple):
     offset_nm: float = 6.0
     drift_n: float = 4.0
     gain: float = 0.3
-    """Largest relative error of the gain of the F/T sensor."""
+    """Maximum relative error of the gain of the F/T sensor."""
     excitation_n2: float = 5.0
-    """Least information on the gain for the self-test."""
+    """Minimum information on the gain for the self-test."""
     noise_n: float = 1.5
     rest_noise_n: float = 0.4
     """Twice that of the noisiest published sensor of this class."""
@@ -52,8 +52,8 @@ class SensorJudge:
     def judge(self, comparison: ForceComparison, depth: float | None) -> list[Breach]:
         """Return the breaches; `depth` [m] is that of the tool below the perceived surface, None while there is none."""
         c = comparison
-        least, most = TUNING.disagreement_n
-        self._limit = min(max(TUNING.disagreement_sd * c.joint_sd, least), most)
+        low, high = TUNING.disagreement_n
+        self._limit = min(max(TUNING.disagreement_sd * c.joint_sd, low), high)
         self._disagreed = self._disagreed + 1 if c.disagreement > self._limit else 0
         limit_sd = TUNING.remainder_sd if self._disagreed < TUNING.disagreements else TUNING.blamed_sd
         if c.remainder > limit_sd:
@@ -92,7 +92,7 @@ class MotionAgreement:
     JUMP_RADPS: Final = 4.0
     """Faster than any joint: a jump, which other checks name."""
     AGAINST_RAD: Final = 1e-3
-    """Least motion of a joint between two measurements whose velocity has the other sign: twice that of a velocity that lags by
+    """Minimum motion of a joint between two measurements whose velocity has the other sign: twice that of a velocity that lags by
     20 ms in a reversal of 5 rad/s^2."""
 
     def __init__(self) -> None:

@@ -33,24 +33,24 @@ class SensesTuning(NamedTuple):
     fast_mps: float = 0.1
     """A tool that is faster does not touch anything: strokes are at 0.03 m/s."""
     free_ft_n: float = 1.0
-    """Largest tared force in free air by the F/T sensor."""
+    """Maximum tared force in free air by the F/T sensor."""
     free_joints_n: float = 2.0
-    """The same by the joints."""
+    """Maximum tared force in free air by the joints."""
     offset_rad: float = 0.3
     """Travel of the joints, summed, over which their offsets are learned: gravity errors change with the posture."""
     tare_s: float = 1.0
     """Time over which F/T bias and joint offsets are learned at rest."""
     start_s: float = 0.1
-    """The same before the arm first moves."""
+    """Time over which they are learned before the arm first moves."""
     friction_gain: float = 0.03
     """Part of the joints' deviation that a sample adds to their friction."""
     slow_radps: float = 0.003
     """v_0: joint speed at which friction is half of its value."""
     torque_sd_nm: float = 0.3
-    """Least standard deviation of a joint's external torque."""
+    """Minimum SD of a joint's external torque."""
     torque_sd_share: float = 0.005
-    """The same over the torque of a joint with a torque sensor, for friction, and over its change from the mean of the last
-    `tare_s` in free air, for errors of mass: after a fast motion the offset is still that of another posture."""
+    """SD of a joint's external torque over its torque (friction) and over the change of that from its mean of the last `tare_s`
+    in free air (errors of mass), with a torque sensor: after a fast motion the offset is still that of another posture."""
     damping_nms: float = 2.0
     """Error of the joints' damping [N m s/rad], twice that of typical equipment: in fast motion the joints feel less exactly."""
     force_max_n: float = 100.0
@@ -69,7 +69,7 @@ class SensesTuning(NamedTuple):
 
 BY_SENSORS: Final = SensesTuning()
 BY_CURRENT: Final = BY_SENSORS._replace(torque_sd_share=0.04)
-"""For an arm that takes positions: its torques are those of the drives' currents, with the friction of the gears."""
+"""Limits for an arm that takes positions: its torques are those of the drives' currents, with the friction of the gears."""
 Arrays = tuple[Array, Array, Array]
 
 
@@ -94,9 +94,9 @@ class ForceComparison(NamedTuple):
     disagreement: float
     """Magnitude of the difference of the tared forces."""
     remainder: float
-    """Largest external torque of a joint that no force at the tool explains, in standard deviations."""
+    """Maximum external torque of a joint that no force at the tool explains, in standard deviations."""
     offset_nm: float
-    """Largest offset of a joint."""
+    """Maximum offset of a joint."""
     drift: float
     """Change of the F/T bias since the arm first moved."""
     gain: float
@@ -106,7 +106,7 @@ class ForceComparison(NamedTuple):
     noise: float
     """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise."""
     rest_noise: float
-    """The same at the latest rest in free air, where the arm's vibrations do not add to it."""
+    """Noise at the latest rest in free air, where the arm's vibrations do not add to it."""
     joint_sd: float = 0.0
     """Standard deviation of the force by the joints in the direction that they feel least."""
 

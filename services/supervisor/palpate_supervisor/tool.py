@@ -41,7 +41,7 @@ class Tool(NamedTuple):
     force: float
     """Magnitude of the external force [N]: the larger of both senses. By the F/T sensor: minus tool weight and first bias."""
     joint_force: float = 0.0
-    """The same by the joints alone [N]."""
+    """Magnitude of the external force by the joints alone [N]."""
 
 
 class ToolSense:
@@ -55,7 +55,7 @@ class ToolSense:
         self._mass = robot.tool_mass_kg
         self._velocity_W: Array | None = None
         self.comparison: ForceComparison
-        """Of the two senses, after the latest measurement."""
+        """Comparison of both senses after the latest measurement."""
         self._indenter = self._model.getFrameId("indenter")
         self._sensor = self._model.getFrameId("ft_sensor")
         self._p_WI: Array = self._data.oMf[self._indenter].translation

@@ -128,14 +128,14 @@ class Sphere(NamedTuple):
     w: Vector
     """Angular velocity [rad/s]."""
     radius: float
-    """[m]"""
+    """Radius [m]."""
 
 
 class Push(NamedTuple):
     """Resultant of the frictionless contact forces."""
 
     force: Vector
-    """On the sphere [N]."""
+    """Contact force on the sphere [N]."""
     normal: Vector
     """Sum of contact forces times outward vertex normals [N]."""
     arm: Vector

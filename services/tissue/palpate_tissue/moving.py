@@ -60,7 +60,7 @@ class MovingBody(Service):
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """Same as `step`, in the tissue's order."""
+        """Do what `step` does, in the tissue's order."""
         t_s = t / NS
         if t_s <= self._motion.at_s:
             yield from self._tissue.parts(t, inbox)

@@ -32,7 +32,7 @@ from palpate_tissue.surface import SkinSurface
 _log = logging.getLogger("palpate.tissue")
 
 MOST_MISSED_STEPS = 200
-"""Largest number of missed steps that one tick makes up for, in wall-clock mode."""
+"""Maximum number of missed steps that one tick makes up for, in wall-clock mode."""
 
 
 class TissueService(Service):
@@ -61,7 +61,7 @@ class TissueService(Service):
         """Maps rows of homogeneous world coordinates, points (1) and vectors (0), to rows in A; shape (4, 3)."""
         self._vertices_W = np.ascontiguousarray(apply(self._X_WA, truth.vertices).T)
         self._normals_W = self._R_WA @ truth.normals.T
-        """At rest, shape (3, n): numpy is several times faster with the long axis last."""
+        """Vertices and normals of the surface at rest, shape (3, n): numpy is several times faster with the long axis last."""
         self._triangles = truth.triangles.astype(np.uint32).ravel()
         self._period = contract().roles[self.role].period
         self._t: int | None = None
@@ -90,7 +90,7 @@ class TissueService(Service):
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """Same as `step`; the wrench comes first because the robot waits for it."""
+        """Do what `step` does; the wrench comes first because the robot waits for it."""
         tool = inbox.latest("sim/tool_state")
         F_W = self._wrench(t, tool)
         yield {"sim/contact_wrench": WrenchStamped(header(t, "world"), wrench_message(F_W))}

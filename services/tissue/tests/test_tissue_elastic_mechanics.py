@@ -164,7 +164,7 @@ def test_breathing_lifts_the_skin_into_the_sphere() -> None:
 
 def test_too_many_vertices_are_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch, pytest.raises(UserError, match="edge_m"):
-        patch.setattr("palpate_tissue.backends.elastic.compliance.COMPLIANCE", ComplianceTuning(most_vertices=100))
+        patch.setattr("palpate_tissue.backends.elastic.compliance.COMPLIANCE", ComplianceTuning(max_vertices=100))
         compliance(flat(), thickness_m=0.1)
     with pytest.raises(ValueError, match="thickness_m"):
         compliance(flat(), (LUMP,), thickness_m=np.inf)

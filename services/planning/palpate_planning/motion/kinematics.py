@@ -24,7 +24,7 @@ class KinematicLimits(NamedTuple):
     """Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
     perceived surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
     too_straight_rad: float = 0.15
-    """Smallest elbow angle in contact, where the wall may be deeper than perceived."""
+    """Minimum elbow angle in contact, where the wall may be deeper than perceived."""
 
 
 KINEMATIC_LIMITS = KinematicLimits()

@@ -22,7 +22,7 @@ class PlannerTuning(NamedTuple):
     """Tuning of the motion planner."""
 
     iterations: int = 6000
-    """Largest number of RRT-Connect iterations."""
+    """Maximum number of RRT-Connect iterations."""
     range_rad: float = 0.4
     """Longest extension of the tree."""
     blends_rad: tuple[float, float, float] = (0.25, 0.1, 0.03)

@@ -21,7 +21,7 @@ class CollisionTuning(NamedTuple):
     margin_m: float = 0.010
     """Clearance of free motion: more than half the motion of any point of the arm between two checks."""
     step_rad: float = 0.02
-    """Largest joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
+    """Maximum joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
     links_apart: int = 3
     """Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits."""
 

@@ -121,7 +121,7 @@ class PostureTuning(NamedTuple):
     """Tuning of the optimised postures."""
 
     knots: int = 32
-    """Largest number of optimised targets; postures in between are interpolated and projected onto their targets."""
+    """Maximum number of optimised targets; postures in between are interpolated and projected onto their targets."""
     smoothness: float = 2.0
     """Weight of squared joint travel [1/rad^2] between knots of mean spacing (assumed)."""
     pressing_force_n: float = 15.0
@@ -143,7 +143,7 @@ class PostureSequence(NamedTuple):
     margin: Array
     """Distance to the nearest joint limit [rad], shape (n,)."""
     torque_fraction: Array
-    """Largest joint torque over its limit, from gravity and pressing force [1], shape (n,)."""
+    """Maximum joint torque over its limit, from gravity and pressing force [1], shape (n,)."""
     dexterity: Array
     """Distance from singularity, sqrt(det(J J^T)) of the length-scaled Jacobian [1], shape (n,)."""
     refined: bool

@@ -20,7 +20,7 @@ class PostureCost(NamedTuple):
     """Scales of the cost of a posture, and the weights of its terms, each of order one (assumed)."""
 
     elbow_clearance_m: float = 0.15
-    """Least height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
+    """Minimum height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
     elbow_softness_m: float = 0.03
     """Height over which the cost of a low elbow begins."""
     reach_m: float = 0.4

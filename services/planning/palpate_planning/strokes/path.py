@@ -63,9 +63,9 @@ class PathLimits(NamedTuple):
     """Limits of the motion along a path."""
 
     lateral_acceleration_mps2: float = 0.3
-    """Largest v^2/r in curves in contact [m/s^2] (assumed)."""
+    """Maximum v^2/r in curves in contact [m/s^2] (assumed)."""
     turn_rate_radps: float = 0.6
-    """Largest rate at which the tool axis turns in contact [rad/s] (assumed)."""
+    """Maximum rate at which the tool axis turns in contact [rad/s] (assumed)."""
     acceleration_mps2: float = 0.2
     """Tangential acceleration in contact [m/s^2] (assumed)."""
 

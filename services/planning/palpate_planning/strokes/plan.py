@@ -53,7 +53,7 @@ class ExamPlan(NamedTuple):
     """All motions of an examination."""
 
     approach: JointTrajectory
-    """To above the first target."""
+    """Motion to above the first target."""
     segments: tuple[Segment, ...]
     """Strokes alternate with paths above the surface."""
     skipped: dict[int, Cause]
@@ -100,10 +100,10 @@ class ExamPlanner:
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
         xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
-        least = bend or KINEMATIC_LIMITS.straight_rad
-        postures, skipped = self._reachable(perceived, xy, q_now, contact, least)
+        min_bend = bend or KINEMATIC_LIMITS.straight_rad
+        postures, skipped = self._reachable(perceived, xy, q_now, contact, min_bend)
         segments = SegmentPlanner(
-            self._kinematics, contact, perceived.surface, postures, known, least, lambda q0, q1: self._motion(free, q0, q1)
+            self._kinematics, contact, perceived.surface, postures, known, min_bend, lambda q0, q1: self._motion(free, q0, q1)
         )
         joined = scan_of(exam, perceived.surface.in_A).joined
         breaks: set[int] = set()

@@ -24,7 +24,7 @@ class ForecastTuning(NamedTuple):
     """Time constant of the blend from one forecast to the next. During the blend the older forecast still adds its error (0.69 mm
     with 0.1 s, 0.53 mm with this; tuning seeds 1 and 2, 8 mm deep)."""
     inward_mps: float = 0.1
-    """Greatest speed at which a receding wall is joined: four times that of a deep breath. A camera may be wrong."""
+    """Maximum speed at which a receding wall is joined: four times that of a deep breath. A camera may be wrong."""
     steps_kept: float = 0.98
     """Forgetting factor of the mean square step per message: an average over 50 messages, about a breath."""
     exposures: int = 60

@@ -78,12 +78,12 @@ class FieldTuning(NamedTuple):
     grid_m: float = 0.004
     """Spacing of the spline grid; finer than the perceived detail."""
     steepest: float = 10.0
-    """Largest slope (84 degrees) that a height field represents."""
+    """Maximum slope (84 degrees) that a height field represents."""
     iterations: int = 4
-    """Largest number of iterations in the search for the foot of a perpendicular."""
+    """Maximum number of iterations in the search for the foot of a perpendicular."""
     converged_m: float = 1e-6
     stride_m: float = 0.02
-    """Largest motion of the foot in one iteration."""
+    """Maximum motion of the foot in one iteration."""
 
 
 FIELD = FieldTuning()

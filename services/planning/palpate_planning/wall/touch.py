@@ -29,15 +29,15 @@ class OnsetTuning(NamedTuple):
     begun_n: float = 0.2
     """Force that gives the initial guess of the onset."""
     window_m: float = 0.010
-    """Smallest depth range used in the fit."""
+    """Minimum depth range used in the fit."""
     air_m: float = 0.003
     """Depth range in air used in the fit, also on a soft wall, where FELT_N is reached at more than 7 mm."""
     samples_min: int = 8
     model_sd_m: float = 0.00025
     """SD of d0 from deviations from the law."""
     model_sd_fraction: float = 0.035
-    """Least SD of d0 as a fraction of the distance from d0 to FELT_N: a different exponent causes a proportional error (0.055 for
-    1.45)."""
+    """Minimum SD of d0 as a fraction of the distance from d0 to FELT_N: a different exponent causes a proportional error (0.055
+    for 1.45)."""
     unfitted_sd_m: float = 0.001
     """SD of d0 without a fit, as on bone, where force rises within a few samples: d0 is where the force began."""
 

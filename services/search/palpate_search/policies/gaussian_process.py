@@ -51,7 +51,7 @@ def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
     exponent = load_calibration().exponent
     xy = np.array([felt.xy for felt in posterior.presses])
     force = np.array([max(felt.force, 0.1) for felt in posterior.presses])
-    depth = np.array([max(felt.depth, PRESSES.least_measured_m) for felt in posterior.presses])
+    depth = np.array([max(felt.depth, PRESSES.min_measured_m) for felt in posterior.presses])
     y = np.log(force) - exponent * np.log(depth / press.DEPTH_M)
     y = (y - y.mean()) / max(float(y.std()), 0.05)
     kernel = RBF(TUNING.length_m) + WhiteKernel(TUNING.noise**2)

@@ -93,7 +93,7 @@ DISPARITY_STEP_PX: Final = 0.125
 RANGE_M: Final = (0.4, 4.5)
 """Depth outside is invalid: Nguyen's model starts at 0.4 m; the far end is assumed."""
 GRAZING_RAD: Final = (np.deg2rad(70.0), np.deg2rad(85.0))
-"""From the first angle on, pixels get lost, from the second all are (assumed; Nguyen's fit has a pole at 90 deg)."""
+"""Angles from which some pixels and all pixels are lost (assumed; Nguyen's fit has a pole at 90 deg)."""
 
 
 def axial_sigma(z: Vector, theta: Vector) -> Vector:

@@ -111,7 +111,7 @@ class View(NamedTuple):
     gu: Image
     """Change of w per pixel to the right, on the facet that is seen [1/(m px)]."""
     gv: Image
-    """The same per pixel downwards."""
+    """Change of w per pixel downwards, on the facet that is seen [1/(m px)]."""
     cos: Image
     """Cosine of the angle between the ray and the facet's normal, in [0, 1]."""
 

@@ -36,8 +36,8 @@ class ClearanceTuning(NamedTuple):
     """When the step skips collision detection."""
 
     reach_m: float = 1.5
-    """Largest distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
-    least_rad: float = 0.01
+    """Maximum distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
+    min_rad: float = 0.01
     """Clearance below which DART detects collisions: much more than the joints turn in a step."""
     check_every: int = 20
     """Steps between checks while the clearance is too small."""
@@ -222,13 +222,13 @@ class DartPlant:
     def _is_clear(self) -> bool:
         """Return True if no contact is possible during the coming step."""
         self._free_travel -= sum(map(abs, self.v.tolist())) * DT
-        if self._free_travel > CLEARANCE.least_rad:
+        if self._free_travel > CLEARANCE.min_rad:
             return True
         if self._check_in:
             self._check_in -= 1
             return False
         self._free_travel = self._clearance.angle(self.q)
-        clear = self._free_travel > CLEARANCE.least_rad
+        clear = self._free_travel > CLEARANCE.min_rad
         self._check_in = 0 if clear else CLEARANCE.check_every
         return clear
 
@@ -269,4 +269,4 @@ class DartPlant:
 
     def contacts(self) -> int:
         """Return the number of contact points with table or base in the last step."""
-        return 0 if self._free_travel > CLEARANCE.least_rad else int(self._world.getLastCollisionResult().getNumContacts())
+        return 0 if self._free_travel > CLEARANCE.min_rad else int(self._world.getLastCollisionResult().getNumContacts())

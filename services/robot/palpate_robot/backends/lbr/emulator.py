@@ -69,7 +69,7 @@ class SessionTuning(NamedTuple):
 SESSION: Final = SessionTuning()
 
 QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.GOOD), (0.30, ConnectionQuality.FAIR))
-"""Largest fraction of lost answers per quality (assumed); above the last it is POOR."""
+"""Maximum fraction of lost answers per quality (assumed); above the last it is POOR."""
 
 
 class Drive(NamedTuple):

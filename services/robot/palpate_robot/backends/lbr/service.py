@@ -15,7 +15,7 @@ from palpate_robot.backends.lbr.arm import MeasuredLbr
 from palpate_robot.backends.lbr.port import ZenohPort
 
 DAMPING: Final = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
-"""Largest joint damping in a hold [N m s/rad] (assumed). The overlay is one to three cycles late, on a filtered speed. Below the
+"""Maximum joint damping in a hold [N m s/rad] (assumed). The overlay is one to three cycles late, on a filtered speed. Below the
 arm's viscous friction (10) it is stable with any delay; joints with enough inertia take more."""
 
 

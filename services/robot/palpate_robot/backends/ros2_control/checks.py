@@ -16,17 +16,17 @@ class CheckTuning(NamedTuple):
     """Commands of this time count, and a deviation lasts as long before it is reported: an arm at level position lags by less."""
     every_s: float = 0.02
     position_rad: float = 0.02
-    """Largest distance of a measured position from all commanded ones of the window."""
+    """Maximum distance of a measured position from all commanded ones of the window."""
     torque_nm: float = 6.0
-    """The same for torques: the error of friction, load data and sensors of a real arm together is less."""
+    """Maximum distance of a torque from all commanded ones: more than friction, load data and sensors of an arm cause."""
     pose_m: float = 0.1
-    """The same for the tool under a Cartesian impedance of the stack: a spring that yields."""
+    """Maximum distance of the tool's pose under a Cartesian impedance of the stack: a spring that yields."""
     contact_n: float = 2.0
     """Change of the external force that counts as a contact: beyond noise and inertia of the tool."""
     baseline_s: float = 2.0
     """Time constant of the force in free motion."""
     axial: float = 0.5
-    """Least share of the force along the tool for a verdict: a push from the side says nothing."""
+    """Minimum share of the force along the tool for a verdict: a push from the side says nothing."""
 
 
 TUNING: Final = CheckTuning()

@@ -73,10 +73,10 @@ class Rules(ABC):
             number = float(value)
         except ValueError:
             number = np.nan
-        least, most = self.ranges.get(name, (0.0, np.inf))
-        if not least <= number <= most or name not in (*self.settings, "recover"):
+        low, high = self.ranges.get(name, (0.0, np.inf))
+        if not low <= number <= high or name not in (*self.settings, "recover"):
             raise UserError(
-                f"event {text!r}: want a name of {', '.join((*self.settings, 'recover'))} and a number from {least:g} to {most:g}"
+                f"event {text!r}: want a name of {', '.join((*self.settings, 'recover'))} and a number from {low:g} to {high:g}"
             )
         if name == "recover":
             self._recover()
@@ -186,8 +186,8 @@ class UrRules(Rules):
             self._target = command
         speed = self.settings["speed"]
         share = 1.0 - np.exp(-self._dt * speed / self.settings["lookahead"])
-        most = self._arm.velocity_radps * speed * self._dt
-        self._reference = self._reference + np.clip(share * (self._target - self._reference), -most, most)
+        max_step = self._arm.velocity_radps * speed * self._dt
+        self._reference = self._reference + np.clip(share * (self._target - self._reference), -max_step, max_step)
         return self._reference
 
     def _recover(self) -> None:

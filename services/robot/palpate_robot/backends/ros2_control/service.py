@@ -27,7 +27,7 @@ from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 from palpate_robot.driver import HoldCause
 
 DAMPING_SHARE: Final = 0.1
-"""Largest joint damping in a hold over that of the simulated driver (assumed): it acts one to three cycles late."""
+"""Maximum joint damping in a hold over that of the simulated driver (assumed): it acts one to three cycles late."""
 _TOLERANCE: Final = {
     CommandLevel.TORQUE: TUNING.torque_nm,
     CommandLevel.POSITION: TUNING.position_rad,

@@ -20,7 +20,7 @@ from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.watchdog import Watchdog, watch
 
 DAMPING_SHARE = 0.05
-"""Of the simulated driver's damping in a hold (assumed): it acts later than that of the driver."""
+"""Share of the simulated driver's damping in a hold (assumed): it acts later than that of the driver."""
 
 
 def message(q: Array, torque: Array) -> Any:

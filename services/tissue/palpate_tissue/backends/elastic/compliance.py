@@ -44,17 +44,17 @@ class ComplianceTuning(NamedTuple):
     integral (corrected trapezoidal rule; Marin, Runborg and Tornberg 2014). Regularised lattice sums (Epstein zeta at 1/2) give
     3.900 on a square and 3.921 on a hexagonal lattice, so it hardly depends on the mesh."""
     farthest: float = 12.0
-    """Largest tabulated distance over thickness; beyond it the skin of a layer is at rest."""
+    """Maximum tabulated distance over thickness; beyond it the skin of a layer is at rest."""
     pitch_m: float = 0.0125
     """Edge of the finite elements of the healthy body; those of a lesion near the skin are finer."""
     grid_half_m: float = 0.13
-    """Largest half width of the uniform part of the grid: 0.1 m of region plus a margin."""
+    """Maximum half width of the uniform part of the grid: 0.1 m of region plus a margin."""
     poisson: float = 0.49
-    most_vertices: int = 20_000
+    max_vertices: int = 20_000
     """The matrix of this many vertices takes 1.6 GB."""
-    most_nodes: int = 2000
+    max_nodes: int = 2000
     """Skin nodes of the body's finite elements: a minute on one core; the time grows with the third power."""
-    most_lesion_nodes: int = 1100
+    max_lesion_nodes: int = 1100
     """Skin nodes about a lesion, whose pitch is coarser for a larger one."""
 
 
@@ -234,9 +234,9 @@ def compliance(
     Raises UserError for a mesh that is too large.
     """
     free = np.flatnonzero(~model.fixed)
-    if len(free) > COMPLIANCE.most_vertices:
+    if len(free) > COMPLIANCE.max_vertices:
         raise UserError(
-            f"services.tissue = elastic: {len(free)} free vertices, at most {COMPLIANCE.most_vertices} possible: use a coarser "
+            f"services.tissue = elastic: {len(free)} free vertices, at most {COMPLIANCE.max_vertices} possible: use a coarser "
             "mesh (phantom.edge_m), or services.tissue = winkler"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
@@ -314,10 +314,10 @@ class _Body(NamedTuple):
     def _grid(self) -> NodeGrid:
         half = self._front()
         grid = graded_grid(-half, half, self.thickness, self.pitch)
-        if (count := math.prod(map(len, grid.skin))) > COMPLIANCE.most_nodes:
+        if (count := math.prod(map(len, grid.skin))) > COMPLIANCE.max_nodes:
             raise UserError(
                 f"services.tissue = elastic: a body {self.thickness:.3g} m thick and {2 * half[0]:.2g} x {2 * half[1]:.2g} m "
-                f"wide needs {count} nodes, at most {COMPLIANCE.most_nodes} possible: a thicker or smaller one, "
+                f"wide needs {count} nodes, at most {COMPLIANCE.max_nodes} possible: a thicker or smaller one, "
                 "or services.tissue = winkler"
             )
         return grid
@@ -332,7 +332,7 @@ class _Body(NamedTuple):
         low, high = np.maximum(centre - reach, -half), np.minimum(centre + reach, half)
         pitch = max(
             min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth),
-            math.sqrt(math.prod(high - low) / COMPLIANCE.most_lesion_nodes),
+            math.sqrt(math.prod(high - low) / COMPLIANCE.max_lesion_nodes),
         )
         return graded_grid(low, high, self.thickness, pitch)
 

@@ -38,7 +38,7 @@ class ElasticTuning(NamedTuple):
     """Springs act this far beyond the sphere. Further away the wall is hardly stiffer than at rest: less than 1 % of the
     force."""
     muscle_beyond_m: float = 0.025
-    """Same with muscle, which resists any displacement."""
+    """Springs act this far beyond the sphere on muscle, which resists any displacement."""
     press_step_s: float = 0.02
     """Step of a standard press; its reading differs by less than 0.1 % from that with 1 ms."""
 

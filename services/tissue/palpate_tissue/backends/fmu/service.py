@@ -30,7 +30,7 @@ from palpate_tissue.moving import carry
 _log = logging.getLogger("palpate.tissue")
 
 MAX_CATCH_UP_STEPS = 1000
-"""Largest number of missed steps that an FMU of fixed step size makes up in one tick."""
+"""Maximum number of missed steps that an FMU of fixed step size makes up in one tick."""
 
 
 class FmuService(Service):

@@ -229,7 +229,7 @@ class ImplicitTuning(NamedTuple):
     """Accuracy of the implicit steps."""
 
     far_sweeps: int = 20
-    """Largest number of sweeps per step of the other vertices."""
+    """Maximum number of sweeps per step of the other vertices."""
     reach_lengths: float = 1.5
     """Vertices within this many Pasternak lengths of the sphere are stepped."""
     far_s: float = 0.15

@@ -14,7 +14,7 @@ from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 
 STEP_LIMIT = 1.8
-"""Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps or more."""
+"""Maximum dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps or more."""
 MOST_SUBSTEPS = 64
 
 
@@ -26,7 +26,7 @@ class Mechanics(NamedTuple):
     damping: Array
     """Diagonal of C [N s/m], shape (n,)."""
     rate: float
-    """Largest eigenvalue of C^-1 K [1/s], with the nonlinear springs at their largest stiffness."""
+    """Maximum eigenvalue of C^-1 K [1/s], with the nonlinear springs at their largest stiffness."""
 
     def substeps(self, dt: float) -> int:
         """Return the number of equal explicit steps per period `dt` [s] for which each is stable and passive.

@@ -39,7 +39,7 @@ class PressSweeps(NamedTuple):
     over_relaxation: float = 1.5
     close_m: float = 2e-6
     """Convergence of sweeps: largest motion of a vertex."""
-    most: int = 200
+    max_sweeps: int = 200
 
 
 SWEEPS = PressSweeps()
@@ -148,7 +148,7 @@ def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array
             u[i] *= deeper  # initial guess
             s[i] = kept * u[i] - relaxed
         stride = Stride(h, kept, SWEEPS.over_relaxation)
-        for _ in range(SWEEPS.most):
+        for _ in range(SWEEPS.max_sweeps):
             if sweep(wall, part, room, activation, stride) < SWEEPS.close_m:
                 break
         forces[step] = hold_force(wall, skin, part, room, activation, h, p, normal)
