@@ -18,14 +18,14 @@ def command(role: str, *words: str) -> tuple[str, ...]:
 
 def main(arguments: list[str]) -> None:
     """Run the service to its end and exit with status 0, or 3 if the run failed or was aborted."""
-    from palpate_bus.run import choose_service, run_service  # noqa: PLC0415 - commands that only start services need neither
+    from palpate_bus.run import load_service, run_service  # noqa: PLC0415 - commands that only start services need neither
     from palpate_models.scenario.load import load_scenario  # noqa: PLC0415
 
     roles = [name for name in contract().roles if name != "conductor"]
     if not arguments or arguments[0] not in roles:
         sys.exit(f"usage: python -m {MODULE} ROLE [NAME_OR_FILE]; ROLE is one of {', '.join(roles)}")
     role, *words = arguments
-    run_service(role, lambda: choose_service(role, load_scenario, words[:1]))
+    run_service(role, lambda: load_service(role, load_scenario, words[:1]))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.fields import leaves, numbers
 from palpate_bus.messages.stamps import NS
-from palpate_bus.run import choose_service, run_service
+from palpate_bus.run import load_service, run_service
 from palpate_bus.wire.transport import Sender, Transport
 from palpate_models.scenario.load import load_scenario
 
@@ -149,7 +149,7 @@ def serve(arguments: Sequence[str]) -> None:
     """Run a service with a fault; see the module's description."""
     role, topic, kind, count = arguments
     fault = InjectedFault(topic, kind, int(count))
-    run_service(role, lambda: choose_service(role, load_scenario), lambda session: FaultyTransport(session, fault))
+    run_service(role, lambda: load_service(role, load_scenario), lambda session: FaultyTransport(session, fault))
 
 
 if __name__ == "__main__":

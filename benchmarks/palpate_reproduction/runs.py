@@ -14,7 +14,7 @@ from palpate.live.bus import join_bus
 from palpate.live.graph import present
 from palpate.live.topic import topic_rows
 from palpate.report.archive import read_completed
-from palpate_bus.runs.announcement import Run, live
+from palpate_bus.runs.announcement import Run, live_runs
 
 GRAPH: Final = "graph.json"
 SCENARIO: Final = "clean"
@@ -115,4 +115,4 @@ def _last_line(folder: Path) -> str:
 
 def _await_run(folder: Path, pid: int) -> Run | None:
     """Return the run of a process once it is announced."""
-    return next((run for run in live() if run.pid == pid or Path(run.out) == folder.resolve()), None)
+    return next((run for run in live_runs() if run.pid == pid or Path(run.out) == folder.resolve()), None)

@@ -51,7 +51,7 @@ def _node(
     if not apart:
         return LockstepNode(services, members)
     if len(services) > 1:
-        raise BusConfigError(f"{', '.join(members)} in one process: in {runtime}, {', '.join(apart)} must be alone")
+        raise BusConfigError(f"{', '.join(apart)} need their own process in {runtime} mode; the group is {', '.join(members)}")
     if not member.rules.roles[first.role].observer:
         return WallClockNode(first, member)
     return RecorderNode(first, member) if isinstance(first, RawRecorder) else ObserverNode(first, member)
@@ -62,8 +62,8 @@ def in_background(role: Role, runtime: str) -> bool:
     return role.observer or (runtime == "lockstep" and role.period > MS)
 
 
-def choose_service(role: str, load: Callable[[str], Any], words: Sequence[str] = ()) -> Service:
-    """Return the service of `role` that the first word names, or else the scenario that `load` reads.
+def load_service(role: str, load: Callable[[str], Any], words: Sequence[str] = ()) -> Service:
+    """Create the service of `role`: the implementation that the first word names, if any, else the one the scenario selects.
 
     Raises BusConfigError, PluginError.
     """

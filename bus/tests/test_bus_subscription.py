@@ -166,6 +166,6 @@ def test_only_holders_of_the_key_move_the_arm_and_anyone_stops_it(request_: str,
     payload = codec.encode(OperatorRequest(header(0), getattr(OperatorRequest, request_), ""), topic.type)
     tagged = ATTACHMENT + tagger.tag(ATTACHMENT, payload)
     now = time_ns()
-    assert check.accepts(ATTACHMENT, now, payload) is obeyed
-    assert check.accepts(tagged, now, payload)
-    assert check.accepts(tagged, now, payload) is obeyed, "replayed"
+    assert check.is_valid(ATTACHMENT, now, payload) is obeyed
+    assert check.is_valid(tagged, now, payload)
+    assert check.is_valid(tagged, now, payload) is obeyed, "replayed"

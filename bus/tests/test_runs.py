@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from palpate_bus.runs import run_folder
-from palpate_bus.runs.announcement import Announcement, NoBus, Run, find, find_all, live
+from palpate_bus.runs.announcement import Announcement, NoBusError, Run, find, find_buses, live_runs
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.wire.zenoh_config import TLS_FILES
 
@@ -92,9 +92,9 @@ def _announced(*runs: Run) -> Iterator[None]:
 
 
 def test_nothing_to_join() -> None:
-    with pytest.raises(NoBus, match="no active run"):
+    with pytest.raises(NoBusError, match="no active run"):
         find()
-    with pytest.raises(NoBus, match="no active run 'healthy'; active: none"):
+    with pytest.raises(NoBusError, match="no active run 'healthy'; active: none"):
         find(chosen="healthy")
 
 
@@ -103,7 +103,7 @@ def test_a_folder_that_has_other_files_keeps_them(tmp_path: Path) -> None:
     (tmp_path / "package.json").write_text("{}", encoding="utf-8")
     (tmp_path / "17-4711.json").write_text("{}", encoding="utf-8")
     announced = Announcement(Run("healthy", ENDPOINTS))
-    assert [run.name for run in live()] == ["healthy"]
+    assert [run.name for run in live_runs()] == ["healthy"]
     assert {path.name for path in tmp_path.iterdir()} == {"package.json", announced.path.name}
     assert announced.path.stat().st_mode & 0o777 == 0o600
     announced.withdraw()
@@ -118,9 +118,9 @@ def test_the_one_run() -> None:
 
 def test_several_runs_are_named_unless_all_are_meant() -> None:
     with _announced(Run("healthy", ENDPOINTS, pid=1), Run("two_lesions", ENDPOINTS, pid=2)):
-        with pytest.raises(NoBus, match=r"2 runs are active: healthy \(process 1\), two_lesions \(process 2\)"):
+        with pytest.raises(NoBusError, match=r"2 runs are active: healthy \(process 1\), two_lesions \(process 2\)"):
             find()
-        assert {target.title for target in find_all()} == {"healthy", "two_lesions"}
+        assert {target.title for target in find_buses()} == {"healthy", "two_lesions"}
         assert find(chosen="two").title == "two_lesions"
 
 

@@ -20,7 +20,7 @@ from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
-from palpate_bus.runs.announcement import Run, live
+from palpate_bus.runs.announcement import Run, live_runs
 from palpate_bus.runs.operator import OperatorKeys, order
 from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.runtime.member import Member
@@ -137,7 +137,7 @@ def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Sess
 
 def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
     """Draw `run` until it ends, and forward operator `keys`. Returns how the run ended."""
-    rules, key = contract(), run.secret()
+    rules, key = contract(), run.read_key()
     with session(run.options()) as bus, _operator(run, bus) as operator:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
         control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
@@ -163,7 +163,7 @@ def follow(run: Run, service: DashboardService, report: Callable[[str], None], k
                     end = f"the run was aborted: {message.reason}"
             if monotonic() - checked > CHECK_S:
                 checked = monotonic()
-                if all((other.pid, other.started) != (run.pid, run.started) for other in live()):
+                if all((other.pid, other.started) != (run.pid, run.started) for other in live_runs()):
                     end = "the run disappeared"
         observed.drain_and_step()
         service.flush()

@@ -40,13 +40,13 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
     from palpate.console import print_json
-    from palpate_bus.runs.announcement import NoBus
+    from palpate_bus.runs.announcement import NoBusError
     from palpate_errors import ExitStatus
     from palpate_models.scenario.load import load_scenario
 
     if role not in SUITES:
         own = "; for a role of your own write a module with suite(rig) in palpate/check/suites"
-        raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}{own}")
+        raise NoBusError(f"no suite for {role!r}; there is one for {', '.join(SUITES)}{own}")
     settings = RigSettings(
         load_scenario(scenario, [*STILL, *(given or ())]), 1e3 * slack, motion or role != "robot" or service is not None
     )

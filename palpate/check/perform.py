@@ -25,7 +25,7 @@ from palpate_bus import implementations
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import MS, NS
-from palpate_bus.runs.announcement import NoBus
+from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
@@ -83,14 +83,14 @@ class LiveRig(Rig):
     # -- protocol
 
     def await_implementation(self, seconds: float) -> None:
-        """Wait for the role to appear, send hello and start it. Raises NoBus if it does not appear within `seconds`."""
+        """Wait for the role to appear, send hello and start it. Raises NoBusError if it does not appear within `seconds`."""
         self.section("protocol")
         gc.freeze()  # a full collection during a check would delay commands beyond their validity
         end = monotonic() + seconds
         while self.role.name not in self._others():
             if monotonic() > end:
                 why = f"no node {self.role.name!r} appeared within {seconds:.0f} s"
-                raise NoBus(f"{why}; it needs a liveliness token of that name")
+                raise NoBusError(f"{why}; it needs a liveliness token of that name")
             self._say(RunControl.HELLO)
             sleep(TIMING.hello_s)
         self.expect("joins as a node of its role", True, self.role.name, self.role.name)
@@ -266,7 +266,7 @@ def start_implementation(command: str | None, role: str, settings: RigSettings, 
         try:
             child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
         except OSError as error:
-            raise NoBus(f"--start {command}: {error}") from error
+            raise NoBusError(f"--start {command}: {error}") from error
         try:
             yield
             with suppress(subprocess.TimeoutExpired):
@@ -306,7 +306,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
 def check_live(
     role: str, settings: RigSettings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
 ) -> ConformanceReport:
-    """Wait for an implementation on the bus and check it there. Raises NoBus if none joins."""
+    """Wait for an implementation on the bus and check it there. Raises NoBusError if none joins."""
     options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
     with session(options) as bus:
         where = ", ".join(connect) if connect else listen

@@ -17,7 +17,7 @@ from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import MS, header
-from palpate_bus.runtime.lockstep import Packet, Sent, Stepper
+from palpate_bus.runtime.lockstep import Outgoing, Packet, Stepper
 from palpate_bus.service import Service
 from palpate_models.scenario.schema import Scenario
 
@@ -240,7 +240,7 @@ class ServiceRig(Rig):
         log = self.log[refused.topic]
         log.append(ReceivedMessage(self.t, refused.message, len(log) + 1, self.t))
 
-    def _take(self, sent: list[Sent]) -> None:
+    def _take(self, sent: list[Outgoing]) -> None:
         for port, packet in sent:
             message = codec.decode(packet.payload, port.topic.type)
             self.log[port.topic.name].append(ReceivedMessage(self.t, message, packet.sequence, self.t))

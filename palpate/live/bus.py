@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 import typer
 import zenoh
 
-from palpate_bus.runs.announcement import BusTarget, NoBus, find
+from palpate_bus.runs.announcement import BusTarget, NoBusError, find
 from palpate_bus.wire.zenoh_config import BusOptions, session
 
 _ENDPOINT = "Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."
@@ -45,11 +45,11 @@ def join_bus(connect: Sequence[str] | None, run: str | None, domain: int | None)
 
 
 def _wait_for_links(bus: zenoh.Session, options: BusOptions) -> None:
-    """Wait until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBus if none has."""
+    """Wait until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBusError if none has."""
     wanted = len(options.connect) + bool(options.router)
     end = monotonic() + LINK_TIMEOUT_S
     while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:
         sleep(0.02)
     if wanted and not links:
         tried = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        raise NoBus(f"no answer at {tried}")
+        raise NoBusError(f"no answer at {tried}")

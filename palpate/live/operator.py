@@ -9,7 +9,7 @@ import zenoh
 
 from palpate.console import SteadyConsole, say
 from palpate.live.bus import ChosenRun
-from palpate_bus.runs.announcement import BusTarget, find, find_all
+from palpate_bus.runs.announcement import BusTarget, find, find_buses
 from palpate_bus.runs.operator import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
 from palpate_errors import ExitStatus, PalpateError
@@ -57,7 +57,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
     """
     console = SteadyConsole(stderr=True)
     failed = False
-    for bus in find_all(chosen=name) if everyone else [find(chosen=name)]:
+    for bus in find_buses(chosen=name) if everyone else [find(chosen=name)]:
         try:
             with session(bus.operator()) as joined:
                 answer, after_ms = _answer(joined, bus, word, reason, ms)
@@ -73,7 +73,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
 
 def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: int) -> tuple[str, float]:
     """Return the answer to a request; asks again until the run is discovered, since links to its peers come up one by one."""
-    end, key = monotonic() + 1.0, bus.secret()
+    end, key = monotonic() + 1.0, bus.read_key()
     while monotonic() < end:
         with suppress(NoConductorError):
             return ask(joined, bus.domain, word, reason, ms, key)

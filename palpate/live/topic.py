@@ -20,7 +20,7 @@ from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runs.announcement import NoBus
+from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.wire.liveliness import Entity, EntityKind
 from palpate_bus.wire.rmw import parse_key, topic_key
 from palpate_bus.wire.transport import ReceivedSample, Subscription
@@ -216,14 +216,14 @@ def _subscribe(name: str, connect: list[str] | None, run: str | None, domain: in
             try:
                 codec.message_type(kind)
             except codec.CodecError as error:
-                raise NoBus(f"topic {name}: {error}") from error
+                raise NoBusError(f"topic {name}: {error}") from error
             row = Topic(name=name, type=kind, producer="", readers={}, qos="event", event=True, doc="")
         with closing(every_sender(bus.session, row, bus.target.domain)) as reader:
             yield row, reader
 
 
-def _unknown(name: str) -> NoBus:
-    return NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
+def _unknown(name: str) -> NoBusError:
+    return NoBusError(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
 
 
 def _until(reader: Subscription, seconds: float | None) -> Iterator[ReceivedSample]:
@@ -252,7 +252,7 @@ def _message(received: ReceivedSample, topic: Topic) -> Any:
     try:
         return codec.decode(received.payload, topic.type)
     except codec.CodecError as error:
-        raise NoBus(f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}: {error}") from error
+        raise NoBusError(f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}: {error}") from error
 
 
 def _stamp_ns(received: ReceivedSample, topic: Topic) -> int | None:
@@ -263,12 +263,12 @@ def _stamp_ns(received: ReceivedSample, topic: Topic) -> int | None:
 def plain(message: Any, *, full: bool, path: str | None = None) -> Any:
     """Return a message, or its field `path`, as values for YAML and JSON. Without `full` long arrays are shortened.
 
-    Raises NoBus naming the fields when there is no such field.
+    Raises NoBusError naming the fields when there is no such field.
     """
     for name in (path or "").split(".") if path else []:
         names = [field.name for field in fields(message)] if is_dataclass(message) else []
         if name not in names:
-            raise NoBus(f"no field {path!r}: no {name!r} among {', '.join(names) or 'nothing (it is a value)'}")
+            raise NoBusError(f"no field {path!r}: no {name!r} among {', '.join(names) or 'nothing (it is a value)'}")
         message = getattr(message, name)
     return _plain(message, full)
 

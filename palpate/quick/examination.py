@@ -163,7 +163,7 @@ class QuickExamination:
         with suppress(StopIteration):
             while True:
                 contact = self._measured()
-                stage = stages.send(StrokeInput(self._count, contact, open=self._open))
+                stage = stages.send(StrokeInput(self._count, contact, gate_open=self._open))
                 rows.append(self._period(stage, contact))
         return rows
 
@@ -242,7 +242,7 @@ class QuickExamination:
         self._count += 1
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT, pushing=stage in PUSHING)
         at = int(motion.along.position * path.per_m + 0.5)
-        self._depth = motion.regulation.reference + loop.regulation.at(k)
+        self._depth = motion.regulation.reference_m + loop.regulation.at(k)
         share = path.breathing[at]
         excursion = patient.tissue.excursion(patient.time + PERIOD_S)
         unseen = (1.0 - loop.followed) * share * (excursion - self._mean_excursion)
@@ -261,7 +261,7 @@ class QuickExamination:
             at=at,
             stage=stage,
             depth=self._depth,
-            setpoint=motion.regulation.reference,
+            setpoint=motion.regulation.reference_m,
             force=self._force,
             followed=loop.followed * share * excursion,
             stroke=self._descent.stroke,

@@ -25,7 +25,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import BROKEN, RecordedMessage, Recording, RecordingError, open_recording
-from palpate_bus.runs.announcement import live
+from palpate_bus.runs.announcement import live_runs
 from palpate_bus.runs.run_folder import in_use
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
@@ -258,7 +258,7 @@ def read_interrupted(folder: Path) -> InterruptedRun:
     Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
     """
     try:
-        if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live()):
+        if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live_runs()):
             raise EvidenceError(f"{folder}: its run is still active; stop it first")
     except OSError as error:
         raise EvidenceError(f"{folder}: cannot be read: {error}") from error

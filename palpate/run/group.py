@@ -11,7 +11,7 @@ from pathlib import Path
 
 from palpate.environment import set_environment
 from palpate_bus.contract import contract
-from palpate_bus.run import Hosted, choose_service, host
+from palpate_bus.run import Hosted, host, load_service
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -86,7 +86,7 @@ def group_command(file: Path, words: Mapping[str, Sequence[str]], own: Mapping[s
 def _hosted(role: str, words: Sequence[str], environment: Mapping[str, str]) -> Hosted:
     def make() -> Service:
         with set_environment(environment):
-            return choose_service(role, load_scenario, words)
+            return load_service(role, load_scenario, words)
 
     with set_environment(environment):
         return Hosted(role, BusOptions.from_settings(Settings.read()), make)

@@ -24,7 +24,7 @@ from palpate.live.topic import app as topic
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, String, Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import MS, header
-from palpate_bus.runs.announcement import Announcement, Run, live
+from palpate_bus.runs.announcement import Announcement, Run, live_runs
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher
@@ -204,10 +204,10 @@ def test_a_killed_run_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     code += "; import time; time.sleep(60)"
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "on\n"
-    assert [found.name for found in live()] == ["x"]
+    assert [found.name for found in live_runs()] == ["x"]
     child.kill()
     child.wait()
-    assert live() == []
+    assert live_runs() == []
     assert list(tmp_path.glob("*.json")) == []
 
 

@@ -113,13 +113,11 @@ def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> I
             allowed = f"a change of {rate:g} {topic.units.get(path, 'rad')} per second"
             got = f"{text}, {(stamp - past.stamp) / 1e6:g} ms apart"
             yield MessageViolation(ViolationKind.CHANGE, path, allowed, got)
-    for count, (path, max_repeats) in zip(past.repeats, topic.varies.items(), strict=True):
-        if count >= max_repeats and repeats(message, past.message, path):
+    for count, (path, limit) in zip(past.repeats, topic.varies.items(), strict=True):
+        if count >= limit and repeats(message, past.message, path):
             values = numbers(message, path)
             text = f"{values.tolist() if values.size <= SHOWN else 'the same values'} in {count + 2} messages in a row"
-            yield MessageViolation(
-                ViolationKind.FROZEN, path, f"at most {max_repeats + 1} equal ones: a live sensor has noise", text
-            )
+            yield MessageViolation(ViolationKind.FROZEN, path, f"at most {limit + 1} equal ones: a live sensor has noise", text)
 
 
 def _too_fast(message: Message, before: Message, path: str, max_change: float) -> str:
@@ -158,7 +156,7 @@ class PortCheck:
     def __init__(self, topic: Topic, sends: bool = False) -> None:
         """`sends`: stamps must be of the sender's present."""
         self._topic = topic
-        self._conforms = conforms(topic.model_dump_json(), sends)
+        self._conforms = compile_check(topic.model_dump_json(), sends)
         self._past = PastMessages([0] * len(topic.varies))
 
     def __call__(self, message: Message, t: int) -> None:
@@ -182,7 +180,7 @@ class Checker:
     """Names the violations of the messages of one topic, each by itself. Fast for messages that conform."""
 
     def __init__(self, topic: Topic) -> None:
-        self._topic, self._conforms = topic, conforms(topic.model_dump_json(), sends=False, alone=True)
+        self._topic, self._conforms = topic, compile_check(topic.model_dump_json(), sends=False, alone=True)
         self._all = leaves(topic.type)
         self._ranges = {path: _paths(leaves(topic.type, path)) for path in topic.ranges}
         ranged = {path for paths in self._ranges.values() for path in paths}
@@ -249,7 +247,7 @@ def _out_of_range(path: str, values: np.ndarray[Any, Any], low: float, high: flo
 
 
 @cache
-def conforms(row: str, sends: bool, alone: bool = False) -> Callable[[Message, PastMessages, int], bool]:
+def compile_check(row: str, sends: bool, alone: bool = False) -> Callable[[Message, PastMessages, int], bool]:
     """Return a function that is True for a message that conforms to its topic, a row as JSON, and keeps it for comparison.
 
     `alone`: without the past.
@@ -322,13 +320,13 @@ class _Source:
 
     def _varies(self) -> Iterator[str]:
         """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
-        for k, (path, max_repeats) in enumerate(self._topic.varies.items()):
+        for k, (path, limit) in enumerate(self._topic.varies.items()):
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
             none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
             yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
-            yield f"elif past.repeats[{k}] < {max_repeats}: past.repeats[{k}] += 1"
+            yield f"elif past.repeats[{k}] < {limit}: past.repeats[{k}] += 1"
             yield "else: return False"
 
     def _new(self) -> str:

@@ -211,8 +211,8 @@ class Contract(_Row):
             if topic.qos not in self.qos:
                 raise ValueError(f"topic {topic.name}: no QoS class {topic.qos!r}; classes are {sorted(self.qos)}")
             if not topic.latched and topic.period_ms % (own_ms := self.roles[topic.producer].period_ms):
-                why = f"not a multiple of the period of {topic.producer}, {own_ms} ms"
-                raise ValueError(f"topic {topic.name}: period {topic.period_ms} ms is {why}")
+                reason = f"not a multiple of the period of {topic.producer}, {own_ms} ms"
+                raise ValueError(f"topic {topic.name}: period {topic.period_ms} ms is {reason}")
             if wrong := topic.readers.keys() - _MAY_KNOW.get(topic.visibility, topic.readers.keys()):
                 raise ValueError(f"topic {topic.name} is {topic.visibility} and must not be read by {sorted(wrong)}")
         self.step_order(tuple(self.roles))

@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 
 DEPTH_ENCODINGS: Final = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3)}
 """Depth encodings of ROS (REP 118): pixel type and unit [m]. Pixels without a measurement are NaN, 0 or 65535 mm."""
-NO_DEPTH_M: Final = 65.5
-"""Depths from this one on [m] are not measurements: 65535 mm, and infinity."""
+MAX_DEPTH_M: Final = 65.5
+"""Upper limit of a valid depth [m]; 65535 mm and infinity mean no measurement."""
 
 
 class MeshArrays(NamedTuple):
@@ -234,5 +234,5 @@ def depth_in_metres(name: str, message: Image) -> NDArray[np.float32]:
         raise ValueError(f"{name}: {data.size} bytes for {height} rows of {step}, {width} pixels each")
     rows = data[: height * step].reshape(height, step)[:, : width * kind.itemsize]
     depth = np.ascontiguousarray(rows).view(kind).astype(np.float32) * np.float32(unit)
-    depth[~((depth > 0) & (depth < NO_DEPTH_M))] = np.nan
+    depth[~((depth > 0) & (depth < MAX_DEPTH_M))] = np.nan
     return depth

@@ -138,20 +138,20 @@ def fit(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDA
 
 
 def encode_wrench_stamped(message: WrenchStamped) -> bytes:
-    """Convert `geometry_msgs/WrenchStamped`."""
+    """Encode `geometry_msgs/WrenchStamped` as CDR."""
     force, torque = message.wrench.force, message.wrench.torque
     return pack_header(message.header, 8) + _WRENCH.pack(force.x, force.y, force.z, torque.x, torque.y, torque.z)
 
 
 def decode_wrench_stamped(data: bytes) -> tuple[WrenchStamped, int]:
-    """Convert `geometry_msgs/WrenchStamped`."""
+    """Decode `geometry_msgs/WrenchStamped` from CDR."""
     header, start = read_header(data, 8)
     fx, fy, fz, tx, ty, tz = _WRENCH.unpack_from(data, start)
     return WrenchStamped(header, Wrench(Vector3(fx, fy, fz), Vector3(tx, ty, tz))), start + _WRENCH.size
 
 
 def encode_tool_state(message: ToolState) -> bytes:
-    """Convert `palpation_msgs/ToolState`."""
+    """Encode `palpation_msgs/ToolState` as CDR."""
     p, q = message.pose.position, message.pose.orientation
     v, w = message.twist.linear, message.twist.angular
     return pack_header(message.header, 8) + _TOOL.pack(
@@ -160,7 +160,7 @@ def encode_tool_state(message: ToolState) -> bytes:
 
 
 def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
-    """Convert `palpation_msgs/ToolState`."""
+    """Decode `palpation_msgs/ToolState` from CDR."""
     header, start = read_header(data, 8)
     px, py, pz, qx, qy, qz, qw, vx, vy, vz, wx, wy, wz, radius = _TOOL.unpack_from(data, start)
     pose = Pose(Point(px, py, pz), Quaternion(qx, qy, qz, qw))
@@ -168,7 +168,7 @@ def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
 
 
 def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
-    """Convert `palpation_msgs/JointTorqueCommand`."""
+    """Encode `palpation_msgs/JointTorqueCommand` as CDR."""
     data = pack_header(message.header, 4)
     for field in ("torque", "position"):
         values = fit(getattr(message, field), _FLOAT64, None, field)
@@ -187,7 +187,7 @@ def _pack_texts(texts: tuple[str, ...]) -> bytes:
 
 
 def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
-    """Convert `palpation_msgs/JointTorqueCommand`."""
+    """Decode `palpation_msgs/JointTorqueCommand` from CDR."""
     header, start = read_header(data, 4)
     torque, start = _read_array(data, start)
     position, start = _read_array(data, start)
@@ -198,7 +198,7 @@ def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
 
 
 def encode_joint_state(message: JointState) -> bytes:
-    """Convert `sensor_msgs/JointState`."""
+    """Encode `sensor_msgs/JointState` as CDR."""
     data = pack_header(message.header, 4) + _pack_names(tuple(message.name))
     position = fit(message.position, _FLOAT64, None, "position")
     velocity = fit(message.velocity, _FLOAT64, None, "velocity")
@@ -213,7 +213,7 @@ def encode_joint_state(message: JointState) -> bytes:
 
 
 def decode_joint_state(data: bytes) -> tuple[JointState, int]:
-    """Convert `sensor_msgs/JointState`."""
+    """Decode `sensor_msgs/JointState` from CDR."""
     header, start = read_header(data, 4)
     names, start = _read_names(data, start)
     joints = _joints(len(names), padding(start + LENGTH.size, 8))

@@ -1,7 +1,7 @@
 """Announcements of runs on this machine, and the search for the bus that a tool in another terminal should join.
 
 The process that starts a run writes a JSON file to `folder()`, readable only by its user. The file is locked while the process
-lives; `live` removes the unlocked files of killed runs. A tool joins (`find`) the first of: `--connect`; `--run`;
+lives; `live_runs` removes the unlocked files of killed runs. A tool joins (`find`) the first of: `--connect`; `--run`;
 PALPATE_CONNECT, PALPATE_ROUTER or PALPATE_ZENOH_CONFIG; the announced runs.
 """
 
@@ -21,7 +21,7 @@ from typing import NamedTuple
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import Settings
-from palpate_bus.wire.rmw import read_key
+from palpate_bus.wire import rmw
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 
@@ -54,9 +54,9 @@ class Run:
     out: str = ""
     """The results folder."""
     keys: str | None = None
-    """Folder of all certificates, in a secure run."""
+    """Folder of all certificates, in a secure run; named as in the announcement."""
     key: str | None = None
-    """File with the run's key, which requests that move the arm need."""
+    """File with the run's key, named as in the announcement; requests that move the arm need it."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
@@ -64,9 +64,9 @@ class Run:
     rate: float | None = None
     """Simulated seconds per second in wall-clock mode."""
 
-    def secret(self) -> bytes | None:
+    def read_key(self) -> bytes | None:
         """Return the run's key. Raises BusConfigError if it cannot be read."""
-        return read_key(Path(self.key) if self.key else None)
+        return rmw.read_key(Path(self.key) if self.key else None)
 
     def options(self, member: str = "viewer") -> BusOptions:
         """Return the options of a tool: a peer of every role without a listener; in a secure run a client with `member`'s key."""
@@ -98,8 +98,7 @@ class Announcement:
 
 def folder() -> Path:
     """Return the folder of announcements; create it if needed. Raises OSError if it belongs to another user."""
-    named = Settings.read().runs
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    named, runtime = Settings.read().runs, os.environ.get("XDG_RUNTIME_DIR")
     if named:
         path = named
     elif runtime and os.access(runtime, os.W_OK):
@@ -112,12 +111,12 @@ def folder() -> Path:
     return path
 
 
-def matching(chosen: str | None) -> list[Run]:
+def matching_runs(chosen: str | None) -> list[Run]:
     """Return the live runs that match a process id or a part of a name, oldest first; all runs for None."""
-    return [run for run in live() if chosen is None or chosen == str(run.pid) or chosen in run.name]
+    return [run for run in live_runs() if chosen is None or chosen == str(run.pid) or chosen in run.name]
 
 
-def live() -> list[Run]:
+def live_runs() -> list[Run]:
     """Return the active runs of this user on this machine, oldest first. Removes files of killed runs."""
     remove_leftovers()
     runs = []
@@ -135,7 +134,7 @@ def live() -> list[Run]:
     return sorted(runs, key=lambda run: run.started)
 
 
-class NoBus(UserError):
+class NoBusError(UserError):
     """No bus to join, or several. Names what was searched and what to do."""
 
 
@@ -157,17 +156,17 @@ class BusTarget(NamedTuple):
         """Simulated seconds per second of a wall-clock run; None in lockstep or if unknown."""
         return self.run.rate if self.run else None
 
-    def secret(self) -> bytes | None:
+    def read_key(self) -> bytes | None:
         """Return the run's key, by default that of PALPATE_KEY. Raises BusConfigError if it cannot be read."""
-        return self.run.secret() if self.run else read_key(Settings.read().key)
+        return self.run.read_key() if self.run else rmw.read_key(Settings.read().key)
 
     def operator(self) -> BusOptions:
         """Return the options of an operator: in a secure run the operator's key instead of the viewer's."""
         return self.run.options(OPERATOR) if self.run else self.options
 
 
-def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> list[BusTarget]:
-    """Return every matching bus, at least one. Raises NoBus, and BusConfigError for invalid settings."""
+def find_buses(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> list[BusTarget]:
+    """Return every matching bus, at least one. Raises NoBusError, and BusConfigError for invalid settings."""
     settings = Settings.read()
     elsewhere = settings.connect or settings.router or settings.zenoh_config
     if connect or (chosen is None and elsewhere):
@@ -178,20 +177,20 @@ def find_all(connect: Sequence[str] | None = None, chosen: str | None = None, do
 
 
 def named_runs(chosen: str | None, otherwise: str = "") -> list[Run]:
-    """Return the matching runs of this machine, oldest first, at least one. Raises NoBus, with the hint `otherwise`."""
-    if found := matching(chosen):
+    """Return the matching runs of this machine, oldest first, at least one. Raises NoBusError, with the hint `otherwise`."""
+    if found := matching_runs(chosen):
         return found
     if chosen is not None:
-        raise NoBus(f"no active run {chosen!r}; active: {_names(live()) or 'none'}")
-    raise NoBus(f"no active run (searched {folder()}); start one with `palpate run`{f', {otherwise}' if otherwise else ''}")
+        raise NoBusError(f"no active run {chosen!r}; active: {_names(live_runs()) or 'none'}")
+    raise NoBusError(f"no active run (searched {folder()}); start one with `palpate run`{f', {otherwise}' if otherwise else ''}")
 
 
 def find(connect: Sequence[str] | None = None, chosen: str | None = None, domain: int | None = None) -> BusTarget:
-    """Return the matching bus. Raises NoBus if there is none or several, and BusConfigError."""
-    found = find_all(connect, chosen, domain)
+    """Return the matching bus. Raises NoBusError if there is none or several, and BusConfigError."""
+    found = find_buses(connect, chosen, domain)
     if len(found) > 1:
         names = _names([target.run for target in found if target.run])
-        raise NoBus(f"{len(found)} runs are active: {names}; choose one with --run NAME or --run PROCESS")
+        raise NoBusError(f"{len(found)} runs are active: {names}; choose one with --run NAME or --run PROCESS")
     return found[0]
 
 

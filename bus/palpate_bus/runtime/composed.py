@@ -7,7 +7,7 @@ from typing import Any
 from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.group import Group
-from palpate_bus.runtime.lockstep import Sent, Stepper, run_hash
+from palpate_bus.runtime.lockstep import Outgoing, Stepper, run_hash
 from palpate_bus.service import Service
 from palpate_errors import RunError
 
@@ -60,7 +60,7 @@ class Composed:
         self.trouble: list[str] = []
         """Messages for the user about them."""
 
-    def _send(self, sent: Sequence[Sent], t: int) -> None:
+    def _send(self, sent: Sequence[Outgoing], t: int) -> None:
         self._group.deliver(sent)
         for tap in self._taps:
             try:

@@ -17,7 +17,7 @@ from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import TIMES
 from palpate_bus.runtime.group import Group
-from palpate_bus.runtime.lockstep import NEVER, ForgedSenderError, InputBuffer, LockstepError, Packet, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, ForgedSenderError, InputBuffer, LockstepError, Outgoing, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.process import process_identity
@@ -39,7 +39,7 @@ class LockstepNode(Node):
         super().__init__(seats, members[seats[0].role])
         self._seat = {seat.stepper: seat for seat in seats}
         self._inputs = {seat: RemoteInputs(seat.stepper, members[seat.role], roles) for seat in seats}
-        self._advances = {
+        self._advance_senders = {
             seat: Advances(seat.stepper, members[seat.role]) for seat in seats if awaited_elsewhere(rules, seat.role, roles)
         }
         self._horizon = NEVER
@@ -52,8 +52,8 @@ class LockstepNode(Node):
             if message is not None and message.command == RunControl.HELLO:
                 for seat in self._seats:
                     seat.output.hello()
-                    if seat in self._advances:
-                        self._advances[seat].hello()
+                    if seat in self._advance_senders:
+                        self._advance_senders[seat].hello()
                     detail = {"missing": self._inputs[seat].missing_inputs(), "process": [one.role for one in self._seats]}
                     seat.reports.send(ServiceReport.READY, NEVER, detail={**detail, **process_identity()})
             elif message is not None:
@@ -79,7 +79,7 @@ class LockstepNode(Node):
     def _step(self, seat: Seat, t: int) -> None:
         self._acting = seat
         self._inputs[seat].await_tick(t, self._attend)
-        everything: list[Sent] = []
+        everything: list[Outgoing] = []
         blame = seat.stepper.blame
         for sent in seat.stepper.parts(t):
             start = perf_counter_ns()
@@ -87,13 +87,13 @@ class LockstepNode(Node):
             blame.send += perf_counter_ns() - start
             everything += sent
         start = perf_counter_ns()
-        if seat in self._advances:
-            self._advances[seat].close(t)
+        if seat in self._advance_senders:
+            self._advance_senders[seat].close(t)
         seat.output.record(everything, t)
         blame.send += perf_counter_ns() - start
         seat.tick = t
 
-    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
+    def _send(self, seat: Seat, sent: Sequence[Outgoing]) -> None:
         self._group.deliver(sent)
         seat.output.send(sent)
 
@@ -148,8 +148,8 @@ class RemoteInputs:
         self._awaited = tuple(buffer for buffer in remote if buffer.edge is not Edge.OBSERVE)
         self._observed = tuple(buffer for buffer in remote if buffer.edge is Edge.OBSERVE)
         producers = sorted({b.topic.producer for b in self._awaited if b.edge.blocking and not b.topic.periodic})
-        self._advances = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
-        self.subscriptions = (*self._data.values(), *self._advances.values())
+        self._advance_inputs = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
+        self.subscriptions = (*self._data.values(), *self._advance_inputs.values())
         self._last: dict[str, tuple[int, int]] = {}
         """Sequence number and sending time of the newest message by topic."""
         self._event_topics = {role: event_topics(self._rules, role) for role in producers}
@@ -158,7 +158,7 @@ class RemoteInputs:
 
     def missing_inputs(self) -> list[str]:
         """Return the keys, without their hash, of the awaited inputs on which no hello was received."""
-        inputs = [self._data[buffer.topic.name] for buffer in self._awaited] + list(self._advances.values())
+        inputs = [self._data[buffer.topic.name] for buffer in self._awaited] + list(self._advance_inputs.values())
         for subscription in inputs:
             while not subscription.hello_received and subscription.get(0) is not None:
                 pass
@@ -184,7 +184,7 @@ class RemoteInputs:
     def _await(self, buffer: InputBuffer, t: int, idle: Callable[[str], None]) -> None:
         begin = perf_counter_ns()
         data = self._data[buffer.topic.name]
-        advance = self._advances.get(buffer.topic.producer) if buffer.topic.event else None
+        advance = self._advance_inputs.get(buffer.topic.producer) if buffer.topic.event else None
         waited = False
         sample: ReceivedSample | None = None
         while not buffer.ready(t):
@@ -196,14 +196,14 @@ class RemoteInputs:
             if sample is None:
                 idle(buffer.topic.name)
             elif source is data:
-                self._accept(buffer, sample)
+                self._accept_or_blame_sender(buffer, sample)
             else:
-                self._settle(buffer.topic.producer, sample)
+                self._receive_advance(buffer.topic.producer, sample)
         if waited and sample is not None:
             duration = perf_counter_ns() - begin
             self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
 
-    def _accept(self, buffer: InputBuffer, sample: ReceivedSample) -> None:
+    def _accept_or_blame_sender(self, buffer: InputBuffer, sample: ReceivedSample) -> None:
         """Give the buffer a message. If its number is wrong, check if two senders share an identity."""
         try:
             buffer.accept(sample.sequence, sample.payload)
@@ -220,7 +220,7 @@ class RemoteInputs:
             raise
         self._last[buffer.topic.name] = (sample.sequence, sample.sent)
 
-    def _settle(self, producer: str, sample: ReceivedSample) -> None:
+    def _receive_advance(self, producer: str, sample: ReceivedSample) -> None:
         last = self._closed[producer]
         if sample.sequence != last + 1:
             raise LockstepError(f"palpate/advance/{producer}: expected message {last + 1}, received {sample.sequence}")

@@ -12,7 +12,7 @@ from math import gcd, lcm
 
 from palpate_bus.contract import Contract
 from palpate_bus.messages import codec
-from palpate_bus.runtime.lockstep import OutputPort, Packet, Sent, Stepper
+from palpate_bus.runtime.lockstep import Outgoing, OutputPort, Packet, Stepper
 from palpate_bus.service import Service
 
 
@@ -49,7 +49,7 @@ class Group:
         """Stop stepping the services of `roles`."""
         self._schedule = self._scheduled(roles)
 
-    def deliver(self, sent: Sequence[Sent]) -> None:
+    def deliver(self, sent: Sequence[Outgoing]) -> None:
         """Deliver messages to their readers in the group."""
         for port, packet in sent:
             for deliver in self._readers[port]:

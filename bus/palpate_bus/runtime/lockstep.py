@@ -98,7 +98,7 @@ class InputBuffer:
     """
 
     __slots__ = (
-        "_advances", "_blocks", "_last_sequence", "_latched", "_periodic", "_unstamped",
+        "_blocks", "_last_sequence", "_latched", "_pending_advances", "_periodic", "_unstamped",
         "advanced", "check", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
     )  # fmt: skip
 
@@ -117,7 +117,7 @@ class InputBuffer:
         self._blocks, self._latched, self._periodic = edge.blocking, edge is Edge.LATCHED, topic.periodic
         self.pending: deque[Packet] = deque()
         self._unstamped: deque[Packet] = deque()
-        self._advances: deque[tuple[int, int]] = deque()
+        self._pending_advances: deque[tuple[int, int]] = deque()
         self._last_sequence = 0
 
     def ready(self, t: int) -> bool:
@@ -134,8 +134,8 @@ class InputBuffer:
         if sequence != self._last_sequence + 1:
             name, last = self.topic.name, self._last_sequence
             missing = f"messages {last + 1}..{sequence - 1} of {self.topic.producer} are missing"
-            why = missing if sequence > last else f"sequence {sequence} is a duplicate after {last}"
-            raise LockstepError(f"{name}: {why}", name)
+            cause = missing if sequence > last else f"sequence {sequence} is a duplicate after {last}"
+            raise LockstepError(f"{name}: {cause}", name)
         self._last_sequence = sequence
         if self._periodic:
             stamp = (sequence - 1) * self.period
@@ -145,16 +145,16 @@ class InputBuffer:
             self.pending.append(Packet(payload, 0, sequence))
         else:
             self._unstamped.append(Packet(payload, NEVER, sequence))
-            self._settle()
+            self._stamp_pending()
 
     def advance(self, tick: int, sequence: int) -> None:
         """Record that the producer has finished `tick` and has sent `sequence` messages of this event topic so far."""
-        self._advances.append((tick, sequence))
-        self._settle()
+        self._pending_advances.append((tick, sequence))
+        self._stamp_pending()
 
-    def _settle(self) -> None:
-        while self._advances and self._advances[0][1] <= self._last_sequence:
-            tick, sequence = self._advances.popleft()
+    def _stamp_pending(self) -> None:
+        while self._pending_advances and self._pending_advances[0][1] <= self._last_sequence:
+            tick, sequence = self._pending_advances.popleft()
             while self._unstamped and self._unstamped[0].sequence <= sequence:
                 packet = self._unstamped.popleft()
                 packet.stamp = tick
@@ -164,7 +164,7 @@ class InputBuffer:
     @property
     def waits_for_data(self) -> bool:
         """True if an advance is known whose messages are not all here."""
-        return bool(self._advances)
+        return bool(self._pending_advances)
 
     @property
     def holds_any(self) -> bool:
@@ -253,7 +253,7 @@ class OutputPort:
         self._unchained: list[bytes] = []
         """Messages that are not in the digest yet; hashing each by itself costs more."""
 
-    def pack(self, message: Message, t: int) -> Sent:
+    def pack(self, message: Message, t: int) -> Outgoing:
         """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
         self.check(message, t)
         sequence = self.sequence = self.sequence + 1
@@ -274,7 +274,7 @@ class OutputPort:
         return None if self._digest is None else self._digest.hexdigest()
 
 
-Sent = tuple[OutputPort, Packet]
+Outgoing = tuple[OutputPort, Packet]
 """A message to be sent."""
 
 
@@ -306,34 +306,34 @@ class Stepper:
         self._rarer = tuple(port for port in periodic if port.period != self.role.period)
         self._chain_every = max(_CHAIN_NS // self.role.period, 1)
 
-    def start(self) -> list[Sent]:
+    def start(self) -> list[Outgoing]:
         """Return the latched messages, packed, with stamp zero."""
         sent = []
         for name, message in self._items(self.service.start()):
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, which is not a latched topic")
-            sent += self._packed(port, (message,), 0)
+            sent += self._pack_messages(port, (message,), 0)
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
         return sent
 
-    def step(self, t: int) -> list[Sent]:
+    def step(self, t: int) -> list[Outgoing]:
         """Step the service at `t` [ns] and return the messages it sends, packed, in outbox order.
 
         Raises LockstepError if a periodic message is missing or is sent off its tick.
         """
         return [one for part in self.parts(t) for one in part]
 
-    def parts(self, t: int) -> Iterator[list[Sent]]:
+    def parts(self, t: int) -> Iterator[list[Outgoing]]:
         """Do what `step` does, but yield the messages of each part of the step before the next is computed."""
         blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
         for outbox in self._outboxes(t):
             stepped = perf_counter_ns()
             blame.compute += stepped - begin - (blame.decode - decoded)
-            sent = self._pack(outbox, t)
+            sent = self._pack_outbox(outbox, t)
             blame.encode += perf_counter_ns() - stepped
             yield sent
             begin, decoded = perf_counter_ns(), blame.decode
@@ -374,22 +374,22 @@ class Stepper:
             kind = type(outbox).__name__
             raise LockstepError(f"{self.role.name} returned {kind}; want an outbox: a dict of topics and messages") from None
 
-    def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
-        sent: list[Sent] = []
+    def _pack_outbox(self, outbox: Outbox, t: int) -> list[Outgoing]:
+        sent: list[Outgoing] = []
         ports = self.ports
         for name, message in self._items(outbox):
             port = ports.get(name) or self._port(name)
             if port.event:
-                sent += self._packed(port, message if isinstance(message, list) else (message,), t)
+                sent += self._pack_messages(port, message if isinstance(message, list) else (message,), t)
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns: not a multiple of its period ({port.period} ns)")
             elif self._refuse is None:
                 sent.append(port.pack(message, t))
             else:
-                sent += self._packed(port, (message,), t)
+                sent += self._pack_messages(port, (message,), t)
         return sent
 
-    def _packed(self, port: OutputPort, messages: Iterable[Message], t: int) -> list[Sent]:
+    def _pack_messages(self, port: OutputPort, messages: Iterable[Message], t: int) -> list[Outgoing]:
         """Return the messages packed, without those that are refused."""
         if self._refuse is None:
             return [port.pack(message, t) for message in messages]

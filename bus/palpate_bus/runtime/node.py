@@ -8,7 +8,7 @@ from typing import Any
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.runtime.conductor_link import TIMES, ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.failure import Failure
-from palpate_bus.runtime.lockstep import NEVER, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Outgoing, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.output import ServiceOutput
 
@@ -110,7 +110,7 @@ class Node(ABC):
         """Step the services until the run ends."""
 
     @abstractmethod
-    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
+    def _send(self, seat: Seat, sent: Sequence[Outgoing]) -> None:
         """Send messages of a service."""
 
     @abstractmethod

@@ -69,7 +69,7 @@ class _Feed:
             try:
                 attachment, payload = sample.attachment.to_bytes(), sample.payload.to_bytes()
                 sequence, sent, _ = unpack(attachment)
-                if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
+                if self._tags is not None and not self._tags.is_valid(attachment, sent, payload):
                     self.dropped["forged"] += 1
                     continue
                 message = self._decode(payload)

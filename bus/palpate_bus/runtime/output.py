@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.messages.stamps import MS
-from palpate_bus.runtime.lockstep import Sent
+from palpate_bus.runtime.lockstep import Outgoing
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
 
@@ -101,13 +101,13 @@ class ServiceOutput:
             publisher.hello()
         self._chunks.hello()
 
-    def send(self, sent: Sequence[Sent]) -> None:
+    def send(self, sent: Sequence[Outgoing]) -> None:
         """Send messages."""
         publishers = self._publishers
         for port, packet in sent:
             publishers[port.topic.name].put(packet.payload, packet.sequence)
 
-    def record(self, sent: Sequence[Sent], t: int) -> None:
+    def record(self, sent: Sequence[Outgoing], t: int) -> None:
         """Add the messages of a step at `t` [ns] to the recorder's chunk, if the run is recorded, and send it when due."""
         writer = self._writer
         if writer is not None:

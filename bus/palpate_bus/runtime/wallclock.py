@@ -23,7 +23,7 @@ from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.messages.stamps import MS
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
-from palpate_bus.runtime.lockstep import NEVER, Packet, Sent, Stepper
+from palpate_bus.runtime.lockstep import NEVER, Outgoing, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.process import lower_priority, niceness_of_period, process_identity
@@ -151,7 +151,7 @@ class WallClockNode(Node):
                     t += late // period * period
                     self._number["skips"] += 1
             self._receive(t)
-            everything: list[Sent] = []
+            everything: list[Outgoing] = []
             for sent in self._stepper.parts(t):
                 start = perf_counter_ns()
                 self._send(self._seat, sent)
@@ -229,7 +229,7 @@ class WallClockNode(Node):
         self._number["refused"] += 1
         self._member.note_refused(refused)
 
-    def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
+    def _send(self, seat: Seat, sent: Sequence[Outgoing]) -> None:
         seat.output.send(sent)
 
     def _counts(self, seat: Seat) -> dict[str, Any]:

@@ -109,7 +109,7 @@ class TagCheck:
         self._values = {} if topic is None else topic.tagged_values
         self._newest = time_ns()
 
-    def accepts(self, attachment: bytes, sent: int, payload: bytes) -> bool:
+    def is_valid(self, attachment: bytes, sent: int, payload: bytes) -> bool:
         """Return True if a message needs no tag or has a valid one; `sent` is its source time [ns]."""
         if self._decode is None:
             return self._tagger.holds(attachment, payload)
@@ -171,11 +171,11 @@ class Subscription:
                 raw = self._queue.get(timeout=left) if left > 0 else self._queue.get_nowait()
             except Empty:
                 return None
-            sample = self._accept(raw)
+            sample = self._unwrap(raw)
             if sample is not None:
                 return sample
 
-    def _accept(self, raw: zenoh.Sample) -> ReceivedSample | None:
+    def _unwrap(self, raw: zenoh.Sample) -> ReceivedSample | None:
         """Return the message of a sample, or None if it is dropped."""
         try:
             attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # a missing one is an AttributeError
@@ -184,7 +184,7 @@ class Subscription:
             self.garbage += 1
             return None
         payload = raw.payload.to_bytes()
-        if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
+        if self._tags is not None and not self._tags.is_valid(attachment, sent, payload):
             self.forged += 1
             return None
         if gid != self._gid:

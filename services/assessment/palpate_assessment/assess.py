@@ -24,7 +24,7 @@ _MOST_CONTRADICTED = 0.3
 
 
 class UnassessedReason(IntEnum):
-    """UnassessedReason why a place is not assessed; numbers of StiffnessMap.msg."""
+    """Reason for which a place is not assessed; numbers of StiffnessMap.msg."""
 
     ASSESSED = 0
     NOT_REACHED = 1
@@ -64,7 +64,7 @@ def assess(
     """Map and findings of a scan; None while there are too few samples.
 
     `reach`: distance within which a sample speaks for a node [m]. `false_findings`: how many a healthy examination may have;
-    without an anatomy, how probable it may be that a finding is none. `prevalence`: share of such persons who have a lump; None
+    without an anatomy, how probable it may be that a finding is none. `prevalence`: share of such patients who have a lump; None
     for that of the fit. `marked`: skin that is scarred.
     """
     o = observe(samples, standard)

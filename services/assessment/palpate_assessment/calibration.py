@@ -40,7 +40,7 @@ class Calibration(BaseModel):
     soft: tuple[float, float, float, float]
     """Weights of the evidence for a soft defect in its log odds against a lump, the constant first."""
     prevalence: float
-    """Share of the persons of the fit who have a lump that can be felt."""
+    """Share of the patients of the fit who have a lump that can be felt."""
     tail: tuple[float, float]
     """Location and scale of a healthy examination's maximum logit: P(max > s) = exp(-(s - location) / scale)."""
 

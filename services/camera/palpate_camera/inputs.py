@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages import Transform
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import NO_DEPTH_M, depth_in_metres, transform_matrix, transform_message
+from palpate_bus.messages.geometry import MAX_DEPTH_M, depth_in_metres, transform_matrix, transform_message
 from palpate_camera.messages import Pinhole
 from palpate_errors import UserError
 
@@ -102,7 +102,7 @@ class CameraInput(NamedTuple):
         """Raise CameraError if no image measures anything, or their depth is not that of a camera."""
         depth = np.concatenate([frame.depth[np.isfinite(frame.depth)] for frame in frames])
         if not len(depth):
-            raise CameraError(f"{self.image}: no pixel has a depth of 0 to {NO_DEPTH_M:g} m: want 32FC1 in m or 16UC1 in mm")
+            raise CameraError(f"{self.image}: no pixel has a depth of 0 to {MAX_DEPTH_M:g} m: want 32FC1 in m or 16UC1 in mm")
         low, high = USUAL_DEPTH_M
         if not low < (usual := float(np.median(depth))) < high:
             raise CameraError(

@@ -27,7 +27,7 @@ import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import ArmModel
-from palpate_control.reference import JOINTS, F, P, Reference, V
+from palpate_control.reference import JOINTS, POSITION, TWIST, WRENCH, Reference
 from palpate_control.safety import SafetyNet
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
@@ -181,23 +181,25 @@ def cartesian_torque(
         friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, n).
         torque: output [N m], shape (n,).
     """
-    q, qd, p_WI, J, bias, gravity = arm
-    p_WD, V_WD, F_W, q_0, qd_0 = x[P], x[V], x[F], x[JOINTS : JOINTS + len(q)], x[JOINTS + len(q) : JOINTS + 2 * len(q)]
+    q, qd, p_WI, J_W, bias, gravity = arm
+    p_WD, V_WD, F_W = x[POSITION], x[TWIST], x[WRENCH]
+    q_0, qd_0 = x[JOINTS : JOINTS + len(q)], x[JOINTS + len(q) : JOINTS + 2 * len(q)]
     K, B, K_0, B_0, J_bar = gains
     viscous, coulomb, velocity_limit = friction[0], friction[1], friction[2]
 
     p_error = clip(R_WD.T @ (p_WD - p_WI), LAW.position_clip_m)
-    R_error = clip(-phi, LAW.rotation_clip_rad)
-    V_error = to_axes(R_WD.T, V_WD - J @ qd)
-    spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # gradient of 1/2 phi' K phi
-    force = to_axes(R_WD, spring + B * V_error) + F_W
+    phi_error = clip(-phi, LAW.rotation_clip_rad)
+    V_error = to_axes(R_WD.T, V_WD - J_W @ qd)
+    # gradient of 1/2 phi' K phi in axes of D: R_DI Jlog^T = Jlog, since phi is the common axis
+    spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * phi_error)))
+    wrench_W = to_axes(R_WD, spring + B * V_error) + F_W
 
     tau_0 = K_0 * (q_0 - q) + B_0 * (qd_0 - qd)
-    null = tau_0 - J.T @ (J_bar.T @ tau_0)
+    null = tau_0 - J_W.T @ (J_bar.T @ tau_0)
     null *= LAW.null_torque_nm / max(LAW.null_torque_nm, np.abs(null).max())  # scaled as a whole: stays in the null space
 
-    qd_d = clip(qd_0 + J_bar @ (V_WD - J @ qd_0), velocity_limit)
-    torque[:] = J.T @ force + null + (bias - gravity) + friction_torque(qd_d, viscous, coulomb)
+    qd_d = clip(qd_0 + J_bar @ (V_WD - J_W @ qd_0), velocity_limit)
+    torque[:] = J_W.T @ wrench_W + null + (bias - gravity) + friction_torque(qd_d, viscous, coulomb)
 
 
 @compiled
@@ -232,28 +234,29 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     """
     stiffness, damping_ratio, K_0 = requested
     turn = np.kron(np.eye(2), R_WD.T)  # twist or wrench from world axes to axes of D
-    J = turn @ J_W
+    J_D = turn @ J_W
     M_inverse, W = np.linalg.inv(M), np.linalg.inv(M + LAW.slow_s * np.diag(D))
-    mobility = J @ M_inverse @ J.T
+    mobility = J_D @ M_inverse @ J_D.T
     inertia = np.diag(np.linalg.inv(mobility + LAW.regularisation * np.eye(6)))
-    slow_inertia = np.linalg.inv(J @ W @ J.T + LAW.regularisation * np.eye(6))
-    friction = (np.diag(slow_inertia) - inertia) / LAW.slow_s
+    slow_inertia = np.linalg.inv(J_D @ W @ J_D.T + LAW.regularisation * np.eye(6))
+    friction_task = (np.diag(slow_inertia) - inertia) / LAW.slow_s
     # Near a singularity the inertia with the other axes held grows without bound; four times the free inertia is enough.
     mass = np.minimum(inertia, 4 / np.diag(mobility))
-    K = np.minimum(stiffness, np.maximum((LAW.spring_angle_rad / dead_time) ** 2 * mass, friction / (4 * dead_time)))
+    K = np.minimum(stiffness, np.maximum((LAW.spring_angle_rad / dead_time) ** 2 * mass, friction_task / (4 * dead_time)))
     B = 2 * damping_ratio * np.sqrt(K * mass)
     B_0 = 2 * LAW.joint_damping_ratio * np.sqrt(K_0 / np.diag(M_inverse))
-    J_bar = W @ J.T @ slow_inertia @ turn
-    return CartesianGains(K, np.maximum(B - friction, LAW.min_damping * B), K_0, B_0, J_bar)
+    J_bar = W @ J_D.T @ slow_inertia @ turn
+    return CartesianGains(K, np.maximum(B - friction_task, LAW.min_damping * B), K_0, B_0, J_bar)
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
     """Return the gains of mode JOINT at inertia `M`, shape (n, n), bounded mode by mode as in `cartesian_gains`."""
     L = np.linalg.cholesky(M)
     L_inverse = np.linalg.inv(L)
-    squared, V = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)
-    P, P_inverse = L @ V, V.T @ L_inverse
-    friction = P_inverse**2 @ viscous_friction
+    squared, eigenvectors = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)
+    modes, modes_inverse = L @ eigenvectors, eigenvectors.T @ L_inverse
+    friction = modes_inverse**2 @ viscous_friction
     squared = np.clip(squared, 0.0, np.maximum((LAW.spring_angle_rad / dead_time) ** 2, friction / (4 * dead_time)))
     damping = 2 * LAW.joint_damping_ratio * np.sqrt(squared)
-    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LAW.min_damping * damping)) @ P.T)
+    damping = np.maximum(damping - friction, LAW.min_damping * damping)
+    return JointGains((modes * squared) @ modes.T, (modes * damping) @ modes.T)

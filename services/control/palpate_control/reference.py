@@ -27,7 +27,7 @@ TUNING = ReferenceTuning()
 # The coordinates of a motion are one vector, shape (18 + 3 n,) for n joints, so that extrapolation and blending are one
 # expression: position, rotation vector relative to the set-point's R_WD in world axes, their velocity, wrench; then joint
 # positions, velocities and accelerations. Only the accelerations are not blended.
-P, PHI, V, F = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 18)
+POSITION, PHI, TWIST, WRENCH = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 18)
 JOINTS = 18
 """Index of the first joint position."""
 _POSE = slice(0, 6)
@@ -43,17 +43,17 @@ class ReferenceMotion(NamedTuple):
     @property
     def p_WD(self) -> Array:
         """[m], shape (3,)."""
-        return self.x[P]
+        return self.x[POSITION]
 
     @property
     def V_WD(self) -> Array:
         """[m/s] and [rad/s], shape (6,)."""
-        return self.x[V]
+        return self.x[TWIST]
 
     @property
     def F_W(self) -> Array:
         """[N] and [N m], shape (6,)."""
-        return self.x[F]
+        return self.x[WRENCH]
 
     @property
     def q(self) -> Array:
@@ -136,7 +136,7 @@ class Extrapolator:
         x: Array = np.array((1.0, age, age * age, exp(fading / TUNING.smoothing_s))).dot(self._terms)
         if since > longest:  # set-points stopped: brake smoothly
             braking, n = exp((longest - since) * 1e-9 / TUNING.smoothing_s), len(setpoint.q)
-            x[V] *= braking
+            x[TWIST] *= braking
             x[JOINTS + n : JOINTS + 2 * n] *= braking
             x[JOINTS + 2 * n :] = 0.0
         return x
@@ -152,7 +152,7 @@ def _terms(setpoint: Setpoint, acceleration: Array) -> Array:
     x, n = coordinates(setpoint, acceleration), len(acceleration)
     terms = np.zeros((4, len(x)))
     terms[0] = x
-    terms[1, _POSE] = x[V]
+    terms[1, _POSE] = x[TWIST]
     terms[1, JOINTS : JOINTS + 2 * n] = x[JOINTS + n :]
     terms[2, JOINTS : JOINTS + n] = acceleration / 2
     return terms

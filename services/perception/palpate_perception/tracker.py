@@ -171,7 +171,7 @@ class PatientMotionTuning(NamedTuple):
     threshold: float = 14.0
     """Motion is detected when its squared Mahalanobis distance exceeds this multiple of the running mean.
 
-    Largest value in three images in a row (tuning seeds): 8.5 for 35 persons with quiet breathing (89 min), 8.9 for 10 with poor
+    Largest value in three images in a row (tuning seeds): 8.5 for 35 patients with quiet breathing (89 min), 8.9 for 10 with poor
     equipment (25 min); at least 73 for 60 shifts of 10 mm, 23 for one along a body of uniform height."""
     mean_tau_s: float = 20.0
     """Time constant of the running mean [s], which is at least 1. Shared pixel errors, not in the covariance, raise it."""

@@ -33,6 +33,7 @@ class DepthTuning(NamedTuple):
     integral_per_s: float = 4.0
     """k_i: well below the impedance's bandwidth of about 5 Hz."""
     integral_max_m: float = 0.004
+    """Limit of the integral, which acts only below an error of the same size: a larger one is a transient."""
     integral_fade_s: float = 0.1
     """Time constant with which the integral fades out of contact."""
     guard_per_s: float = 10.0
@@ -58,14 +59,14 @@ DEPTH: Final = DepthTuning()
 class Regulation(NamedTuple):
     """Output of the regulator at one step."""
 
-    depth: float
-    """Depth to command [m]."""
+    command_m: float
+    """Depth to command."""
     rate: float
-    """Its rate [m/s]."""
-    reference: float
-    """Depth aimed at [m]: the target, or less where force limits it."""
-    force: float
-    """Normal feed-forward force [N], positive into the tissue."""
+    """Rate of the commanded depth [m/s]."""
+    reference_m: float
+    """Depth aimed at: the target, or less where force limits it."""
+    feed_forward_n: float
+    """Normal feed-forward force, positive into the tissue."""
     limited: bool
     """True if depth yields to the force limit."""
     expected_force: float
@@ -94,39 +95,39 @@ class DepthRegulator:
         """Move the zero of all depths: every depth reads `change` [m] more."""
         self._command += change
 
-    def update(self, target: float, depth: float, force: float, load: float, in_contact: bool) -> Regulation:
+    def update(self, *, target_m: float, depth_m: float, normal_force_n: float, load_n: float, in_contact: bool) -> Regulation:
         """Advance one period.
 
         Args:
-            target: depth [m].
-            depth: measured [m].
-            force: normal force [N].
-            load: magnitude of the whole force [N].
+            target_m: target depth.
+            depth_m: measured depth.
+            normal_force_n: normal force.
+            load_n: magnitude of the whole force.
             in_contact: True if the tissue is touched.
         """
         dt = self._dt
-        self._slope += dt / (DEPTH.rate_lag_s + dt) * ((load - self._raw_load) / dt - self._slope)
-        self._raw_load = load
-        self._force += dt / (DEPTH.force_lag_s + dt) * (force - self._force)
-        self._load += dt / (DEPTH.force_lag_s + dt) * (load - self._load)
+        self._slope += dt / (DEPTH.rate_lag_s + dt) * ((load_n - self._raw_load) / dt - self._slope)
+        self._raw_load = load_n
+        self._force += dt / (DEPTH.force_lag_s + dt) * (normal_force_n - self._force)
+        self._load += dt / (DEPTH.force_lag_s + dt) * (load_n - self._load)
         expected = self._load + DEPTH.lead_s * max(self._slope, 0.0)
 
         self._guard += dt * DEPTH.guard_per_s * (expected - self.force_max) / self._stiffness
         self._guard = min(max(self._guard, 0.0), DEPTH.guard_max_m)
-        allowed = target
+        allowed = target_m
         if expected > 0.5 * self.force_max:
-            allowed = min(target, max(depth, DEPTH.model_depth_m) * (self.force_max / expected) ** (1.0 / DEPTH.exponent))
-        step = (target - allowed - self._yield) * dt / (DEPTH.yield_lag_s + dt)
+            allowed = min(target_m, max(depth_m, DEPTH.model_depth_m) * (self.force_max / expected) ** (1.0 / DEPTH.exponent))
+        step = (target_m - allowed - self._yield) * dt / (DEPTH.yield_lag_s + dt)
         self._yield = max(0.0, self._yield + min(max(step, -DEPTH.return_mps * dt), DEPTH.yield_mps * dt))
-        reference = target - self._yield
+        reference = target_m - self._yield
 
-        error = reference - depth
+        error = reference - depth_m
         if in_contact and abs(error) < DEPTH.integral_max_m:
             self._integral += dt * DEPTH.integral_per_s * error
             self._integral = min(max(self._integral, -DEPTH.integral_max_m), DEPTH.integral_max_m)
         elif not in_contact:
             self._integral -= dt / DEPTH.integral_fade_s * self._integral
-        command = min(reference + self._integral - self._guard, max(target, self._depth_max))
+        command = min(reference + self._integral - self._guard, max(target_m, self._depth_max))
         rate = (command - self._command) / dt
         self._command = command
         feed = DEPTH.feed_forward * min(max(self._force, 0.0), self.force_max)

@@ -239,11 +239,11 @@ class Recovery:
         `centre_height` [m]: distance of the sphere's centre from the perceived surface at zero depth.
         """
         p_WI = contact.X_WI[:3, 3]
-        gap = p_WI - centre(point.p, point.n, centre_height, contact.depth)
+        gap = p_WI - centre(point.p_W, point.n_W, centre_height, contact.depth)
         pushed = float(np.linalg.norm(gap)) > RECOVERY.on_path_m
         self.displacement = Displacement(gap, self._period_s) if pushed else None
-        gap = p_WI - point.p
-        return float(np.linalg.norm(gap - (gap @ point.n) * point.n))
+        gap = p_WI - point.p_W
+        return float(np.linalg.norm(gap - (gap @ point.n_W) * point.n_W))
 
     def return_to_path(self, contact: ContactMeasurement) -> None:
         """Return to the path for one period: only clear of the wall, and not while the arm waits or gives up."""

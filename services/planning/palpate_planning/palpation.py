@@ -139,7 +139,7 @@ class Palpation:
     def remaining(self) -> frozenset[int]:
         """Targets of the present stroke that were not measured, and those of the later ones."""
         segment, later = self._motion.segment, self._later
-        if not presses(segment):
+        if not measures_targets(segment):
             return later
         slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
         reached = self.recovery.reached(self._motion.along.position, slid=slid)
@@ -148,7 +148,7 @@ class Palpation:
 
     @property
     def _later(self) -> frozenset[int]:
-        strokes = [segment for segment in self._segments[self._number + 1 :] if presses(segment)]
+        strokes = [segment for segment in self._segments[self._number + 1 :] if measures_targets(segment)]
         return frozenset(int(i) for stroke in strokes for i in stroke.path.targets)
 
     # --- commands -----------------------------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ class Palpation:
             StrokeInput(
                 t,
                 contact,
-                open=self._watch.open,
+                gate_open=self._watch.open,
                 calm=self._watch.calm,
                 aligned=recovery.displacement is None,
                 paused=recovery.paused,
@@ -279,7 +279,7 @@ class Palpation:
         """Wait above the wall; return True if a further segment follows."""
         while True:
             now = yield StrokeStage.WAIT
-            self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
+            self._motion.depth_axis.step(-SEGMENTS.hover_m, STROKE.lift_mps)
             if self.recovery.ending:
                 return False
             if not now.paused and (len(self._segments) > self._number + 1 or not self.more):
@@ -340,7 +340,7 @@ class Palpation:
             setpoint = self.recovery.displacement.move(setpoint)
         limited = is_limited(self.stage, motion)
         steady = contact.touching and self._watch.open and is_steady(self.stage, motion, limited=limited)
-        depth = motion.regulation.reference
+        depth = motion.regulation.reference_m
         return PalpationStep(setpoint, self.stage, depth, steady, limited, motion.target, descent.taring, descent.touched)
 
     # --- interruptions ------------------------------------------------------------------------------------------------
@@ -433,7 +433,7 @@ class Palpation:
         self.ahead = self._later if cause.reason is Reason.WALL_HIDDEN else remaining
 
 
-def presses(segment: Segment) -> bool:
+def measures_targets(segment: Segment) -> bool:
     """Return True for a stroke that measures its targets."""
     return segment.contact and not segment.touch
 

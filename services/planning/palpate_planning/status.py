@@ -34,9 +34,15 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
-    **dict.fromkeys(StrokeStage, Phase.RETRACT),
-    **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),
-    **dict.fromkeys((StrokeStage.SLIDE, StrokeStage.HOLD), Phase.SCAN),
+    StrokeStage.REST: Phase.INDENT,
+    StrokeStage.DESCEND: Phase.INDENT,
+    StrokeStage.SETTLE: Phase.INDENT,
+    StrokeStage.SLIDE: Phase.SCAN,
+    StrokeStage.HOLD: Phase.SCAN,
+    StrokeStage.LIFT: Phase.RETRACT,
+    StrokeStage.TRANSFER: Phase.RETRACT,
+    StrokeStage.WAIT: Phase.RETRACT,
+    StrokeStage.DONE: Phase.RETRACT,
 }
 """The phase to which each stage of a stroke belongs."""
 PALPATING: Final = frozenset(PHASE_OF.values())
@@ -65,7 +71,7 @@ class Observation(NamedTuple):
     """Inputs of one step. A message appears only in the step in which it arrived."""
 
     t: int
-    """[ns]"""
+    """Time [ns]."""
     reading: SensorReading | None
     """None before the first `robot/status`."""
     perceived: PerceivedAbdomen | Cause | None = None
@@ -101,7 +107,7 @@ class ExamStatus:
     force_limited: bool = False
     view_blocked: bool = False
     depth_setpoint: float = 0.0
-    """[m]"""
+    """Target depth [m], negative above the wall."""
     end_tick: int = -1
     """When the run is to end [ns]; -1 while undecided."""
     stroke: int = 0

@@ -86,7 +86,7 @@ class StrokeInput(NamedTuple):
     t: int
     """[ns]"""
     contact: ContactMeasurement
-    open: bool = True
+    gate_open: bool = True
     """True if samples may be taken at this moment of the breath."""
     calm: bool = True
     """True if the wall has been tracked well for long enough to be touched."""
@@ -172,7 +172,7 @@ def _settle(motion: StrokeMotion) -> Stages[None]:
     while waited.s < min_s or (settled.s < STROKE.settled_s and waited.s < STROKE.settle_timeout_s):
         now = yield StrokeStage.SETTLE
         motion.deepen()
-        settled.update(abs(motion.regulation.reference - now.contact.depth) < STROKE.settled_error_m)
+        settled.update(abs(motion.regulation.reference_m - now.contact.depth) < STROKE.settled_error_m)
         waited.update(True)
 
 
@@ -182,7 +182,7 @@ def _slide(motion: StrokeMotion) -> Stages[None]:
     while not arrived:
         now = yield StrokeStage.SLIDE
         motion.deepen()
-        if now.open:
+        if now.gate_open:
             arrived = motion.slide()
         else:
             motion.brake()
@@ -193,7 +193,7 @@ def _hold(motion: StrokeMotion) -> Stages[None]:
     held_s = 0.0
     while held_s < STROKE.hold_s:
         now = yield StrokeStage.HOLD
-        held_s += motion.period_s if now.open else 0.0
+        held_s += motion.period_s if now.gate_open else 0.0
 
 
 def lift(motion: StrokeMotion, height: Callable[[int], float]) -> Stages[None]:
@@ -203,7 +203,7 @@ def lift(motion: StrokeMotion, height: Callable[[int], float]) -> Stages[None]:
         now = yield StrokeStage.LIFT
         motion.brake()
         highest = max(highest, height(now.t))
-        up = motion.depth.step(-highest, STROKE.lift_mps)
+        up = motion.depth_axis.step(-highest, STROKE.lift_mps)
         if up and not now.paused and (now.ending or (now.calm and now.aligned)):
             return
 
@@ -216,7 +216,7 @@ def travel(motion: StrokeMotion, goal: float) -> Stages[None]:
         if now.paused:
             motion.brake()
         elif not now.aligned:
-            motion.depth.step(min(-STROKE.hop_height_m, motion.depth.position), STROKE.lift_mps)
+            motion.depth_axis.step(min(-STROKE.hop_height_m, motion.depth_axis.position), STROKE.lift_mps)
         else:
             arrived = motion.travel(goal)
 
@@ -268,7 +268,7 @@ class Descent:
 
     def rest(self, height: float) -> bool:
         """Rest `height` [m] above the wall; return True once the sensor is tared."""
-        rested_s = self._rested.update(self._motion.depth.step(-height, STROKE.lift_mps))
+        rested_s = self._rested.update(self._motion.depth_axis.step(-height, STROKE.lift_mps))
         over = rested_s >= TOUCH.rest_s + TOUCH.tare_s
         self.taring = not over and rested_s >= TOUCH.rest_s
         self.stroke += over
@@ -279,9 +279,9 @@ class Descent:
 
         What is known of the wall bounds the descent, whatever the force is.
         """
-        contact, depth = now.contact, self._motion.depth
+        contact, depth = now.contact, self._motion.depth_axis
         unsure = TOUCH.sigmas * contact.wall.sigma
-        braking = depth.velocity**2 / MOTION.depth_acceleration_mps2
+        braking = depth.velocity**2 / MOTION.depth_acceleration_mps2  # twice the stopping distance, since jerk is limited
         near = depth.position > -unsure - TOUCH.margin_m - braking
         self._deepest = max(self._deepest, unsure + self._depth)  # monotonic, as the height of a rest
         there = depth.step(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps) or depth.position >= TOUCH.blind_m

@@ -57,12 +57,12 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
         sinking: rate at which `distance` decreases [m/s].
         push: feed-forward force into the tissue [N].
     """
-    p, n, R, q, dp, dn, w, dq = point
     V_WD, F_W = np.empty(6), np.zeros(6)
-    V_WD[:3] = (dp + dn * distance) * rate - n * sinking
-    V_WD[3:] = w * rate
-    F_W[:3] = -n * push
-    return cartesian_setpoint(t, R, p + n * distance, q, V_WD, F_W, dq * rate)
+    V_WD[:3] = (point.dp_ds + point.dn_ds * distance) * rate - point.n_W * sinking
+    V_WD[3:] = point.dphi_ds * rate
+    F_W[:3] = -point.n_W * push
+    p_WD = point.p_W + point.n_W * distance
+    return cartesian_setpoint(t, point.R_WD, p_WD, point.q, V_WD, F_W, point.dq_ds * rate)
 
 
 class StrokeMotion:
@@ -75,14 +75,14 @@ class StrokeMotion:
         self.period_s, self.speed_mps, self.wall = period_s, exam.speed_mps, wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
-        self.depth = self._depth_axis(-SEGMENTS.hover_m)
+        self.depth_axis = self._new_depth_axis(-SEGMENTS.hover_m)
         """Target depth [m], negative above the wall."""
         self._posture: Array | None = None
         """Posture of the last set-point [rad], shape (n,)."""
         self.joined = False
         """True if the commanded depth continues that of the arm; after a free motion it has to be measured first."""
 
-    def _depth_axis(self, depth: float) -> JerkLimitedAxis:
+    def _new_depth_axis(self, depth: float) -> JerkLimitedAxis:
         self._regulator.reset(depth)
         return JerkLimitedAxis(depth, MOTION.depth_acceleration_mps2, MOTION.depth_acceleration_mps2 / 0.05, self.period_s)
 
@@ -117,12 +117,12 @@ class StrokeMotion:
 
     def restart(self, contact: ContactMeasurement) -> None:
         """Continue the segment from rest where it was left, at the present depth of the arm."""
-        self.depth = self._depth_axis(contact.depth)
+        self.depth_axis = self._new_depth_axis(contact.depth)
         self.along = self._path_axis(self.along.position)
 
     def shift(self, outward: float) -> None:
         """Count depth from a wall that is `outward` [m] of the previous estimate; the commanded position stays."""
-        self.depth.shift(outward)
+        self.depth_axis.shift(outward)
         self._regulator.shift(outward)
 
     @property
@@ -137,11 +137,11 @@ class StrokeMotion:
 
     def centre_height(self, t: int) -> float:
         """Return the distance [m] of the sphere's centre from the perceived surface at zero depth, at `t` [ns]."""
-        return self._radius + self.wall.outward(self.point.p, t)
+        return self._radius + self.wall.outward(self.point.p_W, t)
 
     def free_height(self, t: int) -> float:
         """Return the height [m] above the wall at `t` [ns] for free motions, which keep clear of the perceived surface, too."""
-        return SEGMENTS.hover_m + max(0.0, -self.wall.outward(self.point.p, t))
+        return SEGMENTS.hover_m + max(0.0, -self.wall.outward(self.point.p_W, t))
 
     @property
     def ended(self) -> bool:
@@ -181,7 +181,7 @@ class StrokeMotion:
 
     def deepen(self) -> bool:
         """Sink towards full depth, slower near the force limit; return True if it is reached."""
-        return self.depth.step(self._deepest, MOTION.plunge_mps * self._slowdown(0.7, 1.0, 0.01))
+        return self.depth_axis.step(self._deepest, MOTION.plunge_mps * self._slowdown(0.7, 1.0, 0.01))
 
     def slide(self) -> bool:
         """Follow the path in contact, slower above the force limit; return True at its end."""
@@ -220,14 +220,16 @@ class StrokeMotion:
         push back.
         """
         if self.segment.free is not None:  # the stroke after it begins where the arm is then
-            self.depth = self._depth_axis(contact.depth)
-        force = contact.force if pushing else 0.0
-        self.regulation = self._regulator.update(self.depth.position, contact.depth, force, contact.load, in_contact)
+            self.depth_axis = self._new_depth_axis(contact.depth)
+        force, target = contact.force if pushing else 0.0, self.depth_axis.position
+        self.regulation = self._regulator.update(
+            target_m=target, depth_m=contact.depth, normal_force_n=force, load_n=contact.load, in_contact=in_contact
+        )
 
     @property
     def short_of_depth(self) -> bool:
         """True if the target depth has not reached the depth of the examination."""
-        return self.depth.position < self._deepest - DEPTH.limited_m
+        return self.depth_axis.position < self._deepest - DEPTH.limited_m
 
     # --- the set-point ------------------------------------------------------------------------------------------------
 
@@ -236,12 +238,13 @@ class StrokeMotion:
         if self.segment.free is not None:
             return self._free_setpoint(t, contact, rate if self._following else 0.0)
         regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self.period_s
-        outward = self.wall.outward(point.p, t)
-        rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt
-        distance = self._radius + outward - regulation.depth
+        outward = self.wall.outward(point.p_W, t)
+        rising = (self.wall.outward(point.p_W + point.dp_ds * speed * dt, t + round(dt * SECOND)) - outward) / dt
+        distance = self._radius + outward - regulation.command_m
         before, step = contact.q if self._posture is None else self._posture, MOTION.posture_radps * dt
         self._posture = np.clip(point.q, before - step, before + step)
-        return stroke_setpoint(t, point._replace(q=self._posture), speed, distance, regulation.rate - rising, regulation.force)
+        point, sinking = point._replace(q=self._posture), regulation.rate - rising
+        return stroke_setpoint(t, point, speed, distance, sinking, regulation.feed_forward_n)
 
     def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """Return a free motion that starts where the arm is and fades to the planned one: s(x) = 1 - x^2 (3 - 2 x) of the gap.

@@ -94,12 +94,21 @@ def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: i
             depth, measured = float(np.mean(depths[-10:])), float(np.mean(forces[-10:])) + rng.normal(0, 0.016)
             room = 1.0 if latest is None else np.clip((1 - latest[0].expected_force / regulator.force_max) / 0.3, 0.01, 1)
             target = min(target + 0.0002 * room, 0.010)
-            pending = (regulator.update(target, depth, measured, abs(measured), measured > 0.15), t)
-            rows.append((t, pending[0].reference, depth, float(np.mean(forces[-10:])), pending[0].limited))
+            pending = (
+                regulator.update(
+                    target_m=target, depth_m=depth, normal_force_n=measured, load_n=abs(measured), in_contact=measured > 0.15
+                ),
+                t,
+            )
+            rows.append((t, pending[0].reference_m, depth, float(np.mean(forces[-10:])), pending[0].limited))
         goal, rate, feed = -0.01, 0.0, 0.0
         if latest is not None:
             regulation, since = latest
-            goal, rate, feed = regulation.depth + regulation.rate * min(t - since, 0.03), regulation.rate, regulation.force
+            goal, rate, feed = (
+                regulation.command_m + regulation.rate * min(t - since, 0.03),
+                regulation.rate,
+                regulation.feed_forward_n,
+            )
         pull = NORMAL_STIFFNESS * (goal - x) + damping * (rate - v) + feed - F - np.tanh(v / 0.002)
         v += pull / mass * dt
         x += v * dt
@@ -149,25 +158,31 @@ def test_lateral_force_reduces_depth_like_normal_force() -> None:
     regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
     regulator.reset(0.01)
     for _ in range(100):
-        regulation = regulator.update(0.01, 0.01, 11.0, 16.0, True)
+        regulation = regulator.update(target_m=0.01, depth_m=0.01, normal_force_n=11.0, load_n=16.0, in_contact=True)
     assert regulation.limited
-    assert regulation.reference < 0.0085
-    assert regulation.force == pytest.approx(DEPTH.feed_forward * 11.0)
+    assert regulation.reference_m < 0.0085
+    assert regulation.feed_forward_n == pytest.approx(DEPTH.feed_forward * 11.0)
 
 
 def test_where_little_depth_gives_much_force_depth_does_not_return_to_its_target() -> None:
     regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
     regulator.reset(0.0032)
     for _ in range(100):
-        regulator.update(0.01, 0.0032, 11.0, 11.0, True)
-    references = [regulator.update(0.01, 0.0028, 11.0, 11.0, True).reference for _ in range(50)]
+        regulator.update(target_m=0.01, depth_m=0.0032, normal_force_n=11.0, load_n=11.0, in_contact=True)
+    references = [
+        regulator.update(target_m=0.01, depth_m=0.0028, normal_force_n=11.0, load_n=11.0, in_contact=True).reference_m
+        for _ in range(50)
+    ]
     assert max(references) < 0.004
 
 
 def test_depth_is_never_commanded_beyond_its_limit() -> None:
     regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
     regulator.reset(0.0)
-    commands = [regulator.update(0.019, 0.016, 1.0, 1.0, True).depth for _ in range(200)]
+    commands = [
+        regulator.update(target_m=0.019, depth_m=0.016, normal_force_n=1.0, load_n=1.0, in_contact=True).command_m
+        for _ in range(200)
+    ]
     assert 0.0195 < max(commands) <= 0.02
 
 
@@ -175,6 +190,6 @@ def test_in_free_air_nothing_winds_up() -> None:
     regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
     regulator.reset(-0.02)
     for _ in range(500):
-        regulation = regulator.update(-0.02, -0.018, 0.01, 0.01, False)
-    assert regulation.depth == pytest.approx(-0.02)
-    assert regulation.force < 0.02
+        regulation = regulator.update(target_m=-0.02, depth_m=-0.018, normal_force_n=0.01, load_n=0.01, in_contact=False)
+    assert regulation.command_m == pytest.approx(-0.02)
+    assert regulation.feed_forward_n < 0.02

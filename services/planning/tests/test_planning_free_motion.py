@@ -196,7 +196,7 @@ def test_a_stroke_after_a_free_motion_begins_at_the_depth_of_the_arm() -> None:
     for free in (Turn(), None):
         motion.segment = SimpleNamespace(free=free)  # type: ignore[assignment]
         motion.regulate(contact, in_contact=False, pushing=False)  # type: ignore[arg-type]
-    assert motion.regulation.reference == pytest.approx(-0.034, abs=1e-4)
+    assert motion.regulation.reference_m == pytest.approx(-0.034, abs=1e-4)
 
 
 def test_the_posture_of_a_setpoint_moves_no_faster_than_its_limit() -> None:

@@ -152,9 +152,9 @@ def test_a_setpoint_is_the_path_point_at_a_distance_from_the_surface(samples: in
         setpoint = stroke_setpoint(7, point, rate, distance, sinking, push)
         assert setpoint.mode is ControlMode.CARTESIAN
         assert setpoint.stamp == 7
-        assert setpoint.p_WD == pytest.approx(centre(point.p, point.n, distance, 0.0))
-        assert setpoint.R_WD[:, 2] == pytest.approx(-point.n)
-        assert setpoint.F_W.tolist() == [*(-push * point.n), 0.0, 0.0, 0.0]
+        assert setpoint.p_WD == pytest.approx(centre(point.p_W, point.n_W, distance, 0.0))
+        assert setpoint.R_WD[:, 2] == pytest.approx(-point.n_W)
+        assert setpoint.F_W.tolist() == [*(-push * point.n_W), 0.0, 0.0, 0.0]
         assert np.array_equal(setpoint.q, point.q)
 
 

@@ -116,7 +116,10 @@ class TissueService(Service):
         }
 
     def _wrench(self, t: int, tool: Message | None) -> Array:
-        """Step the tissue to `t` [ns]; return force [N] and torque [N m] on the indenter about its centre, world axes, (6,)."""
+        """Step the tissue to `t` [ns]; return force [N] and torque [N m] on the indenter about its centre, world axes, (6,).
+
+        The `F_W` of a set-point is the wrench on the environment, of opposite sign.
+        """
         if tool is None:
             self.backend.idle(t / NS)
             self._t = None

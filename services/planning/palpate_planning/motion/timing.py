@@ -119,7 +119,7 @@ class SpeedLimit:
 
 @dataclass(frozen=True, slots=True)
 class JointTrajectory:
-    """Joint positions [rad] and velocities [rad/s] at every planning period, shapes (n, 7); starts and ends at rest."""
+    """Joint positions [rad] and velocities [rad/s] at every planning period, shapes (m, n); starts and ends at rest."""
 
     q: Array
     qd: Array
@@ -128,7 +128,7 @@ class JointTrajectory:
         return len(self.q)
 
     def at(self, k: float) -> tuple[Array, Array]:
-        """Return position and velocity, shapes (7,), at sample `k` within 0..len - 1, interpolated between samples."""
+        """Return position and velocity, shapes (n,), at sample `k` within 0..len - 1, interpolated between samples."""
         i = int(k)
         part = k - i
         if not part:
@@ -138,7 +138,7 @@ class JointTrajectory:
 
 
 def round_corners(points: Array, blend: float) -> Array:
-    """Return a joint-space polyline, shape (k, n), with corners replaced by sampled parabolas, shape (m, 7).
+    """Return a joint-space polyline, shape (k, n), with corners replaced by sampled parabolas, shape (m, n).
 
     At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola is in the triangle of
     the corner and its two ends, at most blend / 4 from the corner.

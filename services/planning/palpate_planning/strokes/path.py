@@ -77,23 +77,23 @@ _STEP_M = 1e-4
 
 
 class PathPoint(NamedTuple):
-    """A point of a path with its derivatives by path length; world frame."""
+    """A point of a path with its derivatives by path length, in world axes W; D is the desired frame of the indenter."""
 
-    p: Array
+    p_W: Array
     """Surface point [m], shape (3,)."""
-    n: Array
+    n_W: Array
     """Outward unit normal, shape (3,)."""
-    R: Array
+    R_WD: Array
     """Orientation of the indenter, z opposite to n, shape (3, 3)."""
     q: Array
     """Posture [rad], shape (n,)."""
-    dp: Array
-    """dp/ds, shape (3,)."""
-    dn: Array
+    dp_ds: Array
+    """dp/ds [1], shape (3,)."""
+    dn_ds: Array
     """dn/ds [1/m], shape (3,)."""
-    w: Array
-    """Turn of R [rad/m], shape (3,)."""
-    dq: Array
+    dphi_ds: Array
+    """Turn of R_WD per path length [rad/m], shape (3,)."""
+    dq_ds: Array
     """dq/ds [rad/m], shape (n,)."""
 
 
@@ -118,9 +118,9 @@ class SurfacePath:
         """Return the path at length s, clipped to its ends."""
         if self._curve is None:
             still = np.zeros(3)
-            return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], dp=still, dn=still, w=still, dq=np.zeros_like(self.q[0]))
+            return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], still, still, still, np.zeros_like(self.q[0]))
         y, dy, R, w = _along(self._curve, min(max(s, 0.0), self.length))
-        return PathPoint(p=y[:3], n=-R[:, 2], R=R, q=y[9:], dp=dy[:3], dn=dy[3:6], w=w, dq=dy[9:])
+        return PathPoint(y[:3], -R[:, 2], R, q=y[9:], dp_ds=dy[:3], dn_ds=dy[3:6], dphi_ds=w, dq_ds=dy[9:])
 
     def target(self, s: float) -> int:
         """Return the index of the latest target at path length s, of the first target before that."""
@@ -130,7 +130,7 @@ class SurfacePath:
     def speed_limit(self, speed: float, turning: Array) -> SpeedLimit:
         """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast.
 
-        `turning`: greatest joint speeds [rad/s], shape (n,).
+        `turning`: maximum joint speeds [rad/s], shape (n,).
         """
         if self.length == 0.0:
             return SpeedLimit(self.s, np.array([speed]), LIMITS.acceleration_mps2)

@@ -132,7 +132,7 @@ class ExamPlanner:
     def _reachable(
         self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene, bend: float
     ) -> tuple[Array, dict[int, Cause]]:
-        """Return a posture for each target, shape (n, 7), and the targets that none reaches, with the cause."""
+        """Return a posture for each target, shape (k, n) for n joints, and the targets that none reaches, with the cause."""
         p, n = perceived.surface.at(xy)
         robot, limits = self._known.robot, self._known.limits
         centres = centre(p, n, robot.indenter_radius_m, self._known.exam.depth_m)

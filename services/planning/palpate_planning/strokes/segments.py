@@ -71,7 +71,7 @@ class Layout:
 
 
 class SegmentPlanner:
-    """Plans strokes on one surface, given the postures of their targets, shape (n, 7)."""
+    """Plans strokes on one surface, given the postures of their targets, shape (k, n): k targets, n joints."""
 
     def __init__(
         self,
@@ -89,9 +89,9 @@ class SegmentPlanner:
             kinematics: of the arm.
             scene: in which the tool may touch the abdomen.
             surface: the perceived surface.
-            postures: of the targets [rad], shape (n, 7).
+            postures: of the targets [rad], shape (k, n): k targets, n joints.
             known: examination and tool.
-            bend: least bend of the elbow in strokes and on straight paths [rad].
+            bend: minimum bend of the elbow in strokes and on straight paths [rad].
             free_motion: plans from q0 to q1 [rad] without contact, or raises NoPathError.
         """
         self._kinematics, self._scene, self._surface = kinematics, scene, surface

@@ -5,8 +5,8 @@ While the indenter descends at constant speed, the normal force over depth d is
     F = b + a max(d - d0, 0)^1.3.
 
 b, a and d0 are fitted together (Levenberg and Marquardt, `scipy.optimize.curve_fit`): b is the remaining sensor bias, d0 the
-depth of the wall. At 14 mm/s, positions on persons and lumps (tuning seeds 0 to 7) follow the law up to 1 N with exponents of 1.2
-to 1.5, and 1.8 over a guarded muscle. There the error of d0 is -0.02 +- 0.15 mm, and 0.2 mm more where the indenter meets the
+depth of the wall. At 14 mm/s, positions on patients and lumps (tuning seeds 0 to 7) follow the law up to 1 N with exponents of
+1.2 to 1.5, and 1.8 over a guarded muscle. There the error of d0 is -0.02 +- 0.15 mm, and 0.2 mm more where the indenter meets the
 wall between mesh points (computed).
 """
 

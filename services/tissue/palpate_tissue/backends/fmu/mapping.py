@@ -35,7 +35,9 @@ class FrameChange(StrEnum):
     VECTOR = "vector"
 
 
-class _Entry(BaseModel):
+class MapEntry(BaseModel):
+    """Entry of a map, of either direction."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: FrameChange = FrameChange.PLAIN
@@ -43,13 +45,13 @@ class _Entry(BaseModel):
     """Unit of the topic's field if the contract has none."""
 
 
-class InputEntry(_Entry):
+class InputEntry(MapEntry):
     """Source of an FMU's input or tunable parameter."""
 
     field: str
 
 
-class OutputEntry(_Entry):
+class OutputEntry(MapEntry):
     """Source of a topic's field: a variable, a value of the scenario, or a constant."""
 
     variable: str | None = None

@@ -22,7 +22,7 @@ from palpate_bus.messages.stamps import NS, blank
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
-from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
+from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapEntry, MapError, OutputEntry
 
 _log = logging.getLogger("palpate.tissue")
 BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
@@ -102,7 +102,7 @@ def size(name: str, path: str) -> int | None:
 
 
 def fill(message: Message, paths: Sequence[str], value: Any) -> None:
-    """Set fields of base type to a value each, or the only one to all of it: a text, a number or an array."""
+    """Set the field at each path to its value; a single path receives the whole value (text, number or array)."""
     for path, own in zip(paths, [value] if len(paths) == 1 else np.ravel(value).tolist(), strict=True):
         *parents, last = path.split(".")
         owner = attrgetter(".".join(parents))(message) if parents else message
@@ -113,7 +113,7 @@ def fill(message: Message, paths: Sequence[str], value: Any) -> None:
             setattr(owner, last, str(own) if isinstance(before, str) else type(before)(np.ravel(own)[0]))
 
 
-Change = Callable[[Any], Any]
+Convert = Callable[[Any], Any]
 
 
 class InputTopic(NamedTuple):
@@ -121,13 +121,13 @@ class InputTopic(NamedTuple):
 
     topic: Topic
     ports: tuple[Port, ...]
-    moves: tuple[tuple[NDArray[Any], str, Change], ...]
-    """Place in a port, field of the message, and change of its values."""
+    moves: tuple[tuple[NDArray[Any], str, Convert], ...]
+    """Target in a port, field of the message, and conversion of its values."""
 
     def write(self, message: Message) -> None:
         """Set the FMU's variables from a message."""
-        for target, path, change in self.moves:
-            target[...] = np.reshape(change(numbers(message, path)), target.shape)
+        for target, path, convert in self.moves:
+            target[...] = np.reshape(convert(numbers(message, path)), target.shape)
         for port in self.ports:
             port.push()
 
@@ -139,8 +139,8 @@ class OutputTopic(NamedTuple):
     """Name of the FMU's file."""
     topic: Topic
     ports: tuple[Port, ...]
-    moves: tuple[tuple[tuple[str, ...], NDArray[Any], Change], ...]
-    """Fields of base type, place in a port of their values, and change of these."""
+    moves: tuple[tuple[tuple[str, ...], NDArray[Any], Convert], ...]
+    """Fields of base type, source of their values in a port, and conversion of these."""
     constants: tuple[tuple[tuple[str, ...], Any], ...]
 
     def message(self, t: int) -> Message:
@@ -150,7 +150,7 @@ class OutputTopic(NamedTuple):
             if wrong := port.not_finite():
                 raise FmuError(f"{self.fmu}: {wrong} at {t / NS:g} s, for {self.topic.name}: want finite numbers")
         message = blank(self.topic.type, t, self.topic.frame or "")
-        for paths, value in (*self.constants, *((paths, change(source)) for paths, source, change in self.moves)):
+        for paths, value in (*self.constants, *((paths, convert(source)) for paths, source, convert in self.moves)):
             fill(message, paths, value)
         return message
 
@@ -204,8 +204,8 @@ class Wiring:
                 raise MapError(
                     f"{where}: it is a {variable.variability} {variable.causality}; want an input or a tunable parameter"
                 )
-            change = self._change(entry, topic, entry.field, variable, where, into_fmu=True)
-            moves.append((ports[key][key], entry.field, change))
+            convert = self._conversion(entry, topic, entry.field, variable, where, into_fmu=True)
+            moves.append((ports[key][key], entry.field, convert))
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
 
     def _output(self, name: str, entries: Mapping[str, OutputEntry]) -> OutputTopic:
@@ -219,29 +219,30 @@ class Wiring:
         for path, entry in entries.items():
             where, value = sources[path], entry.value
             if (variable := chosen.get(path)) is not None:
-                change = self._change(entry, topic, path, variable, where, into_fmu=False)
-                moves.append((paths[path], ports[variable.name][variable.name], change))
+                convert = self._conversion(entry, topic, path, variable, where, into_fmu=False)
+                moves.append((paths[path], ports[variable.name][variable.name], convert))
                 continue
             if entry.scenario is not None:
                 if entry.scenario not in self._scenario:
                     raise MapError(f"{where}: the scenario gives only {', '.join(self._scenario) or 'nothing'}")
-                value = self._turn(entry, topic, where, into_fmu=False)(self._scenario[entry.scenario])
+                value = self._frame_conversion(entry, topic, where, into_fmu=False)(self._scenario[entry.scenario])
                 if size(topic.type, path) not in (None, np.size(value)):
                     raise MapError(f"{where}: {np.size(value)} values; the field has {size(topic.type, path)}")
             constants.append((paths[path], value))
         return OutputTopic(self._fmu.path.name, topic, tuple(dict.fromkeys(ports.values())), tuple(moves), tuple(constants))
 
-    def _change(self, entry: _Entry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Change:
-        """Return the change of frame and unit of a field's values on the way into the FMU, or back."""
+    def _conversion(self, entry: MapEntry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Convert:
+        """Return the conversion of frame and unit of a field's values on the way into the FMU, or back."""
         room = size(topic.type, path)
         if room is not None and room != variable.size:
             raise MapError(f"{where}: the field has {room} values, the FMU variable {variable.name} has {variable.size}")
-        turn, scale = self._turn(entry, topic, where, into_fmu), self._scale(entry, topic, path, variable, where, into_fmu)
+        turn = self._frame_conversion(entry, topic, where, into_fmu)
+        scale = self._unit_conversion(entry, topic, path, variable, where, into_fmu)
         first, second = (turn, scale) if into_fmu else (scale, turn)
         return lambda values: second(first(values))
 
-    def _turn(self, entry: _Entry, topic: Topic, where: str, into_fmu: bool) -> Change:
-        """Return the change of frame from the topic to the FMU, or back, for points and vectors."""
+    def _frame_conversion(self, entry: MapEntry, topic: Topic, where: str, into_fmu: bool) -> Convert:
+        """Return the conversion of frame from the topic to the FMU, or back, for points and vectors."""
         if entry.kind is FrameChange.PLAIN:
             return _same
         ours, theirs = self._table.frame, topic.frame
@@ -256,7 +257,9 @@ class Wiring:
         moved = X[:3, 3] if entry.kind is FrameChange.POINT else np.zeros(3)
         return lambda values: np.reshape(values, (-1, 3)) @ turned + moved
 
-    def _scale(self, entry: _Entry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Change:
+    def _unit_conversion(
+        self, entry: MapEntry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool
+    ) -> Convert:
         """Return the conversion between the units of topic and FMU."""
         declared = [unit for key, unit in topic.units.items() if path == key or path.startswith(f"{key}.")]
         text = declared[0] if declared else entry.unit

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
-from palpate_models.patient import wall
+from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
@@ -62,7 +62,7 @@ linear
 
 
 class ImplicitPatch(NamedTuple):
-    """The p vertices stepped near the sphere, of which m can be held."""
+    """The p vertices stepped near the sphere, of which m can be held; vectors in A."""
 
     near: NDArray[np.intp]
     """Stepped vertices, shape (p,)."""
@@ -105,7 +105,8 @@ def press(
 ) -> tuple[bool, Array]:
     """Step the vertices near a sphere; return True if it touches, and force [N] and torque [N m] about its centre, shape (6,).
 
-    Rows of `motion` (3, 3): position [m], velocity [m/s] and angular velocity [rad/s] of the sphere. `h` is the step [s].
+    Rows of `motion` (3, 3): position [m], velocity [m/s] and angular velocity [rad/s] of the sphere. All vectors are in A.
+    `excursion` of breathing [m], outward positive; `activation` of muscle, in [0, 1]; step `h` [s].
     """
     sphere = Sphere(row(motion, 0), row(motion, 1), row(motion, 2), radius)
     u, near, room, table = wall.u, patch.near, patch.room, patch.table
@@ -120,7 +121,7 @@ def press(
     for _ in range(SWEEPS):
         sweep(wall, near, room, activation, OWN)
     load = 0.0
-    force = normal = moment = (0.0, 0.0, 0.0)
+    force = normal = weighted_arm = (0.0, 0.0, 0.0)
     for k in range(len(table)):
         at = patch.within[k]
         patch.f[k] = 0.0
@@ -136,12 +137,12 @@ def press(
         load += f
         normal = add(normal, scale(f, n))
         force = add(force, add(scale(f, n), scale(f / (w - along), add(d, scale(along, n)))))
-        moment = subtract(moment, scale(f, add(d, scale(w, n))))  # as in `tissue.hold`
+        weighted_arm = subtract(weighted_arm, scale(f, add(d, scale(w, n))))  # as in `tissue.hold`
     relax(wall, near)
     wrench = np.zeros(6)
     if load <= 0.0:
         return False, wrench
-    add_friction(bristle, sphere, Push(force, normal, divide(moment, load)), h, wrench)
+    add_friction(bristle, sphere, Push(force, normal, divide(weighted_arm, load)), h, wrench)
     return True, wrench
 
 
@@ -363,7 +364,7 @@ def implicit_wall(model: PhantomModel, stiffness: Stiffness, dt: float, longest:
     n, g, tau = len(model.vertices), np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
     K = stiffness_matrix(model, stiffness)
     foundation = model.stiffness * model.areas
-    drag, bent = stiffness.dashpot_s * foundation / dt, wall.straight_from(model.stiffening)
+    drag, bent = stiffness.dashpot_s * foundation / dt, wall_law.straight_from(model.stiffening)
     table = np.column_stack((drag, K.diagonal(), foundation, model.stiffening**2, bent, model.tension))
     return ImplicitWall(
         u=np.zeros(n),
