@@ -305,7 +305,7 @@ class _Source:
     def _rates(self) -> Iterator[str]:
         """Yield the lines that compare fields with those of the message before."""
         for path, rate in self._topic.rates.items():
-            yield f"most = {rate * 1e-9!r} * (stamp - past.stamp)"
+            yield f"max_change = {rate * 1e-9!r} * (stamp - past.stamp)"
             if leaves(self._topic.type, path)[0].message == QUATERNION:
                 yield f"if not turn(m.{path}, before.{path}) <= max_change: return False"
                 continue
