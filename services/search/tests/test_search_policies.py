@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, press_belly, suite
 from palpate_assessment.calibration import load_calibration
-from palpate_assessment.model import natural
+from palpate_assessment.model import field_covariances
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
 from palpate_bus.messages import ExamState, Point, SearchRequest
@@ -148,7 +148,7 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     calibration = load_calibration()
     y = np.log(force) - calibration.exponent * np.log(depth / DEPTH_M) - np.log(USUAL_N)
     lever, away = calibration.exponent / depth, np.log(depth / DEPTH_M)
-    parts = natural(xy, xy, USUAL)
+    parts = field_covariances(xy, xy, USUAL)
     log_joint = []
     out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(CENTRED.size) + 1e-9, axis=1)
     prior = np.where(out, LUMPS.outside, 1.0)
