@@ -2,8 +2,8 @@
 
 The run hash covers message texts, so it changes when a text is reworded. This digest does not: it shows that a change of texts,
 names or message types left every number unchanged. It reads the MCAP file of a run with `--record full`.
-`field_digests.json` has the digests of commit 18583e7e; `region` is `exam.region_m=[0.06,0.06]`, `exam.centre_m=[-0.055,-0.055]`,
-`exam.spacing_m=0.02`, `camera.frames=10`; all runs with `--composed`.
+`field_digests.json` has the digests of commit 18583e7e on one machine; on another, compare two commits. `region` is
+`exam.region_m=[0.06,0.06]`, `exam.centre_m=[-0.055,-0.055]`, `exam.spacing_m=0.02`, `camera.frames=10`; all are composed runs.
 """
 
 import dataclasses
