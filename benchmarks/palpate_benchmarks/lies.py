@@ -266,6 +266,8 @@ def by_wall_clock(lie: Lie, folder: Path) -> FaultLog:
     def on_progress(progress: RunProgress) -> None:
         if progress.t >= lie.at_s * NS:
             log.add(progress, progress.t / 1e6 - lie.at_s * 1e3)
+        else:
+            log.before = signs_of(progress)
 
     with set_environment({liar.VARIABLE: str(lie)}):
         scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
