@@ -21,7 +21,7 @@ from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, CaseResult, FaultCase
-from palpate_benchmarks.injection import SETTINGS, FaultLog, sustained_rate
+from palpate_benchmarks.injection import SETTINGS, FaultLog, signs_of, sustained_rate
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.messages import ExamState
