@@ -272,6 +272,8 @@ def by_wall_clock(lie: Lie, folder: Path) -> FaultLog:
     with set_environment({liar.VARIABLE: str(lie)}):
         scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
         log.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=sustained_rate()))
+    if log.result.interrupted:
+        raise KeyboardInterrupt  # ends the campaign, not the case alone
     return log
 
 
