@@ -114,15 +114,16 @@ def draw_cases(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCas
         yield FaultCase(draw.choice(ENDING), TOGETHER.join(sorted(roles)), draw.choice(modes) == "wallclock", at_s)
 
 
-def run_case(case: FaultCase, folder: Path) -> CaseResult:
+def run_case(case: FaultCase, folder: Path, settings: tuple[str, ...] = ()) -> CaseResult:
     """Run one case; its logs stay in a subfolder of `folder`."""
     result = CaseResult(case.kind, case.target, case.mode, at_s=case.at_s)
     begin = monotonic()
     run, inject = prepare(case, (folder / case.name).resolve(), sustained_rate() if case.wallclock else 1.0)
+    run = run._replace(settings=settings)
     with _network(case) as name:
         ended = inject_fault(run, inject, name)
         if ended is None and case.wallclock:
-            ended = inject_fault(prepare(case, run.folder, sustained_rate(reserve=True))[0], inject, name)
+            ended = inject_fault(run._replace(rate=sustained_rate(reserve=True)), inject, name)
     result.wall_s = round(monotonic() - begin, 1)
     if ended is None:
         result.ended = "the fault was not injected: the indenter did not reach the depth"

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Sequence
+from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from palpate.console import CaseDisplay, SteadyConsole, output_file, refuse, wide_console
 from palpate.report.files import write_text
+from palpate.run.options import Settings
 from palpate_benchmarks.fault_cases import KINDS, LIE, CaseResult, csv_text, from_csv, in_order
 from palpate_errors import ExitStatus
 
@@ -18,7 +20,7 @@ MODES = ("lockstep", "wallclock")
 COLUMNS = ("mode", "fault", "target", "after", "first sign", "arm", "force", "end")
 
 
-def faults(
+def faults(  # noqa: PLR0913 - the options of a command
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
@@ -29,6 +31,7 @@ def faults(
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
     random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
+    settings: Settings = None,
 ) -> None:
     """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the results.
 
@@ -37,6 +40,7 @@ def faults(
     from palpate.study.folder import code_digest
     from palpate_benchmarks import lies
     from palpate_benchmarks.campaign import cases, draw_cases, run_case
+    from palpate_benchmarks.injection import examination
 
     console = SteadyConsole(stderr=True, width=wide_console(200).width)
     modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
@@ -52,15 +56,17 @@ def faults(
         todo += draw_cases(random, seed, modes)
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
-    code = code_digest()[:8]
+    changed = tuple(settings or ())
+    examination(changed)  # a setting that does not fit ends the command here
+    code = sha256("\n".join((code_digest(), *changed)).encode()).hexdigest()[:8]
     done = {result.identity: result.code for result in found}
     if not again:
         todo = [case for case in todo if done.get(case.identity) != code]
     todo = sorted(todo, key=lambda case: case.identity in done)[:limit]
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
-        results = (run_case(case, Path(folder)) for case in todo if case.kind != LIE)
-        lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
+        results = (run_case(case, Path(folder), changed) for case in todo if case.kind != LIE)
+        lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder), changed) if LIE in kinds else ()
         for number, result in enumerate(chain(results, lying), 1):
             result.code = code
             found = [f for f in found if f.identity != result.identity] + [result]

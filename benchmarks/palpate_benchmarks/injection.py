@@ -36,6 +36,7 @@ from palpate_conductor.conductor import conduct
 from palpate_conductor.grants import GRANTS
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Timing
 from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 
 SETTINGS: Final = (
     "exam.region_m=[0.0125, 0.03]",
@@ -85,6 +86,8 @@ class FaultRun(NamedTuple):
     """True to end the run as soon as its outcome is known, before the arm has returned home."""
     secure: bool = False
     """True if all processes are clients of a secure router, so that a fault in its network affects all."""
+    settings: tuple[str, ...] = ()
+    """Changed fields of the scenario, as `a.b=c`."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,11 @@ class CaseOver(RunFailed):
 
     def __init__(self, text: str) -> None:
         super().__init__(FailureCode.STOPPED, text)
+
+
+def examination(settings: Sequence[str] = ()) -> Scenario:
+    """Return the scenario of the cases, with `settings` changed. Raises ScenarioError if one does not fit."""
+    return load_scenario("clean", (*SETTINGS, *settings))
 
 
 def signs_of(progress: RunProgress) -> list[Sign]:
@@ -306,7 +314,7 @@ def serve() -> None:
 
 def _conduct(run: FaultRun, secure: SecureBus | None) -> None:
     roles = tuple(role for group in run.groups for role in group)
-    scenario = load_scenario("clean", SETTINGS)
+    scenario = examination(run.settings)
     timing = Timing(run.wallclock, rate=run.rate)
     record: Record = "full" if "recorder" in roles else "none"
     files = write_scenario_files(scenario, run.folder)

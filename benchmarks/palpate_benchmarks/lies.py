@@ -21,7 +21,7 @@ from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, CaseResult, FaultCase
-from palpate_benchmarks.injection import SETTINGS, FaultLog, signs_of, sustained_rate
+from palpate_benchmarks.injection import FaultLog, examination, signs_of, sustained_rate
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.messages import ExamState
@@ -32,7 +32,7 @@ from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree
 from palpate_conductor.outcome import RunProgress, RunResult, Timing, gave_up
 from palpate_errors import RunError
-from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.load import exam_input
 
 MOMENTS: Final = ("rest", "descent", "depth", "transfer")
 BEFORE_STROKES: Final = (
@@ -216,8 +216,8 @@ def undetectable(lie: Lie) -> str:
 class Lockstep:
     """One examination without a lie, from which the cases are forked at their moments: all share what came before."""
 
-    def __init__(self) -> None:
-        scenario = load_scenario("clean", SETTINGS)
+    def __init__(self, settings: Sequence[str]) -> None:
+        scenario = examination(settings)
         self._collector = Collector(tree=FrameTree(exam_input(scenario)))
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
         self.twin = run_guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
@@ -259,7 +259,7 @@ class Lockstep:
         return log
 
 
-def by_wall_clock(lie: Lie, folder: Path) -> FaultLog:
+def by_wall_clock(lie: Lie, folder: Path, settings: Sequence[str]) -> FaultLog:
     """Return an examination with a lie in wall-clock mode, at the rate that this machine keeps."""
     log = FaultLog(RunResult("wallclock", Collected()))
 
@@ -270,7 +270,7 @@ def by_wall_clock(lie: Lie, folder: Path) -> FaultLog:
             log.before = signs_of(progress)
 
     with set_environment({liar.VARIABLE: str(lie)}):
-        scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
+        scenario = examination((*settings, f"services.{lie.role}={liar.__file__}"))
         log.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=sustained_rate()))
     if log.result.interrupted:
         raise KeyboardInterrupt  # ends the campaign, not the case alone
@@ -309,15 +309,15 @@ def _felt(c: Collected) -> tuple[int, int, float]:
     return felt, 0 if c.findings is None else len(c.findings.findings), background
 
 
-def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[CaseResult]:
+def run_lies(todo: Sequence[FaultCase], folder: Path, settings: Sequence[str] = ()) -> Iterator[CaseResult]:
     """Yield the results of the cases, those in lockstep in the order of their times."""
-    lockstep = Lockstep()
+    lockstep = Lockstep(settings)
     twin = lockstep.twin
     for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.target, twin)))):
         begin, lie = monotonic(), lie_of(case.target, twin)
         result = CaseResult(case.kind, case.target, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
         if case.wallclock:
-            result = judge(result, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+            result = judge(result, lie, by_wall_clock(lie, (folder / case.name).resolve(), settings), twin)
         else:
             result = lockstep.judged(result, lie)
         result.wall_s = round(monotonic() - begin, 1)

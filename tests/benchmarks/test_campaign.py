@@ -12,7 +12,7 @@ from conductor_messages import collected, result
 from palpate_benchmarks.campaign import draw_cases, judge, prepare, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
-from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch
+from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch, examination
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -21,6 +21,7 @@ from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_conductor.outcome import RunProgress
+from palpate_models.scenario.load import ScenarioError
 
 TOPIC = contract().topics["control/joint_torque"]
 
@@ -190,6 +191,12 @@ def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None
     assert case.sign == "planning: conductor lost: gone"
     assert case.named
     assert not case.kept
+
+
+def test_settings_change_the_examination_of_the_cases() -> None:
+    assert examination(("exam.depth_m=0.006",)).exam.depth_m == 0.006
+    with pytest.raises(ScenarioError, match=r"exam\.depth"):
+        examination(("exam.depth=0.006",))
 
 
 @pytest.mark.slow
