@@ -168,6 +168,7 @@ def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
     outcome = run_toys(wallclock=True, faults={"robot": ("joint_states", "nan", "0.5")})
     assert outcome.failure is None
     assert outcome.counters["control"]["refused"] > 0
+    assert outcome.counters["control"]["refused_topics"] == ["joint_states"]
     assert sum("joint_states from robot refused" in text for text in outcome.trouble) == 1
 
 

@@ -298,6 +298,8 @@ def enter(result: CaseResult, log: FaultLog, culprits: Iterable[str], at: float)
     if run.failure is not None:
         result.refused = run.failure.code is FailureCode.CONTRACT_BROKEN
         blamed |= {run.failure.code, *run.failure.roles, *run.failure.topics}
+    for counters in run.counters.values():
+        blamed.update(counters.get("refused_topics", ()))
     if any((sign.source, sign.code) in LATE for sign in log.signs):
         blamed.add(MACHINE)
     result.named = not _with_producers(blamed).isdisjoint(_with_producers(culprits))

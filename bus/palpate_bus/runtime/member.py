@@ -36,7 +36,8 @@ class Member:
         self._tokens = NodeTokens(session, role, domain, self.transport.ids)
         self._subscriptions: list[tuple[str, Subscription]] = []
         self._noted: list[str] = []
-        self._refused: set[str] = set()
+        self.refused_topics: set[str] = set()
+        """Topics of which a message was refused."""
         self._reported: set[str] = set()
         self._routed = bool(list(session.info.routers_zid()))
         self._checked_at = 0.0
@@ -73,8 +74,8 @@ class Member:
 
     def note_refused(self, refused: RefusedMessage) -> None:
         """Note a message that was refused, the first of its topic."""
-        if refused.topic not in self._refused:
-            self._refused.add(refused.topic)
+        if refused.topic not in self.refused_topics:
+            self.refused_topics.add(refused.topic)
             self._noted.append(f"{refused}; such messages are dropped")
 
     def suspicions(self) -> list[str]:

@@ -236,4 +236,4 @@ class WallClockNode(Node):
         ages = {name: age_ms(bins) for name, bins in self._ages.items() if bins}
         dropped = dropped_by(self._data.values())
         dropped["garbage"] += self._link.garbage
-        return {"digests": {}, **dropped, **self._number, "age_ms": ages}
+        return {"digests": {}, **dropped, **self._number, "refused_topics": sorted(self._member.refused_topics), "age_ms": ages}
