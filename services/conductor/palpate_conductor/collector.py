@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import Clock, DiagnosticArray, Quaternion, TFMessage, Transform, TransformStamped, codec
+from palpate_bus.messages import Clock, DiagnosticArray, ExamState, Quaternion, TFMessage, Transform, TransformStamped, codec
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import MS, NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
@@ -40,6 +40,7 @@ class FrameTree:
 
 
 DIAGNOSTICS_PERIOD_NS = NS
+_OVER = frozenset({ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 TF_PERIOD_NS = 50 * MS
 
 
@@ -107,9 +108,11 @@ class Collected:
 
     @property
     def end_tick(self) -> int | None:
-        """Simulated time [ns] at which the run ends; None until planning announces it."""
+        """Simulated time [ns] at which the run ends; None until planning announces it, or says that the examination is over."""
         exam = self.exam
-        return None if exam is None or exam.end_tick < 0 else int(exam.end_tick)
+        if exam is None or (exam.end_tick < 0 and exam.phase not in _OVER):
+            return None
+        return int(exam.end_tick) if exam.end_tick >= 0 else nanoseconds(exam.header.stamp)
 
 
 class CollectedNews:

@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
+from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
-from palpate_bus.messages import IndentationTruth, Point, SupervisorState
+from palpate_bus.messages import ExamState, IndentationTruth, Point, SupervisorState
 from palpate_bus.messages.stamps import header
 from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
@@ -22,7 +23,7 @@ from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.rmw import Tagger
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 from palpate_conductor import grants
-from palpate_conductor.collector import Collector, KeptMessages
+from palpate_conductor.collector import Collected, Collector, KeptMessages
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of
@@ -45,6 +46,21 @@ def test_kept_messages_equal_the_originals() -> None:
     assert len(kept) == 5
     assert list(kept) == list(kept) == messages
     assert (kept[1], kept[-1], kept[::2]) == (messages[1], messages[-1], messages[::2])
+
+
+@pytest.mark.parametrize(
+    ("phase", "announced", "end"),
+    [
+        (ExamState.PHASE_SCAN, -1, None),
+        (ExamState.PHASE_DONE, 70, 70),
+        (ExamState.PHASE_DONE, -1, 50),
+        (ExamState.PHASE_ABORTED, -1, 50),
+    ],
+)
+def test_an_examination_that_is_over_ends_the_run_even_if_planning_announces_no_end(
+    phase: int, announced: int, end: int | None
+) -> None:
+    assert Collected([exam_state(50, phase, end_tick=announced)]).end_tick == end
 
 
 def test_a_pause_has_a_bound_and_is_named() -> None:
