@@ -30,7 +30,7 @@ from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree
-from palpate_conductor.outcome import RunProgress, RunResult, Timing, gave_up
+from palpate_conductor.outcome import RunProgress, RunResult, Timing, incomplete
 from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input
 
@@ -73,7 +73,6 @@ class LieTuning(NamedTuple):
 
 
 LIES: Final = LieTuning()
-HANGS: Final = "the examination did not end"
 LEFT_OUT: Final = {
     "assessment/samples": "only a search reads it",
     "exam/request": "only a search sends it",
@@ -250,9 +249,7 @@ class Lockstep:
         failure: Failure | None
         try:
             run.run(end, LIES.longest_ns)
-            failure = gave_up(collected)
-            if failure is None and collected.end_tick is None:
-                failure = Failure(FailureCode.BLOCKED, HANGS)
+            failure = incomplete(collected)
         except ServiceFailed as error:
             failure = error.failure
         log.result = RunResult("composed", collected, sim_time_s=run.t / NS, failure=failure)
@@ -327,7 +324,7 @@ def run_lies(todo: Sequence[FaultCase], folder: Path, settings: Sequence[str] = 
 def judge(result: CaseResult, lie: Lie, log: FaultLog, twin: Healthy) -> CaseResult:
     """Return the result with forces, signs and outcome."""
     collected, failure = log.result.collected, log.result.failure
-    result.hung = failure is not None and failure.text == HANGS
+    result.hung = failure is not None and failure.code is FailureCode.UNENDED
     felt, findings, background = _felt(collected)
     if failure is not None:
         result.ended = str(failure)

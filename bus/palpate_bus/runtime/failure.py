@@ -45,6 +45,8 @@ class FailureCode(StrEnum):
     DISK_FULL = "disk_full"
     GAVE_UP = "gave_up"
     """Planning aborted the examination."""
+    UNENDED = "unended"
+    """Planning did not end the examination before the limit of simulated time."""
     UNFINISHED = "unfinished"
     """Recovered from a recording without an end."""
     DAMAGED = "damaged"

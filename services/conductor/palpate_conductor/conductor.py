@@ -24,7 +24,7 @@ from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import GRANTS, Grants
 from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
+from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, incomplete
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_inputs import InputError, parse_json
 
@@ -447,7 +447,7 @@ def conduct(
     try:
         with rare_collections():
             conductor.run(exited, report)
-        result.failure = result.failure or gave_up(collector.collected)
+        result.failure = result.failure or incomplete(collector.collected)
     except RunFailed as error:
         result.failure = error.failure
     result.start_time_s = (conductor.started_at or perf_counter()) - begin

@@ -67,14 +67,14 @@ class Grants:
 
         Raises RunFailed if planning announces an end that has passed or, in wall-clock mode, is silent.
         """
+        if end is None and exam + GRANTS.window_ns >= self._limit:
+            end = self._limit
         if self._wallclock:
             self._extend_wallclock(exam, end)
             return
         if self.last:
             self._repeat()
             return
-        if end is None and exam + GRANTS.window_ns >= self._limit:
-            end = self._limit
         tick = max(exam, 0) + GRANTS.window_ns
         if recorded is not None:
             tick = min(tick, recorded + GRANTS.recorder_window_ns)

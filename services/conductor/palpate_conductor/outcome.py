@@ -146,3 +146,11 @@ def gave_up(collected: Collected) -> Failure | None:
     exam = collected.exam
     aborted = exam is not None and exam.phase == ExamState.PHASE_ABORTED
     return Failure(FailureCode.GAVE_UP, str(exam.message)) if exam is not None and aborted else None
+
+
+def incomplete(collected: Collected) -> Failure | None:
+    """Return why the examination of a run without failure is not complete; None if it is, or if there was none."""
+    if collected.exam is None or collected.end_tick is not None:
+        return gave_up(collected)
+    text = f"planning did not end the examination: {collected.exam.message or 'without a message'}"
+    return Failure(FailureCode.UNENDED, text, ("planning",), ("exam/state",))

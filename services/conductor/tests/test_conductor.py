@@ -14,7 +14,7 @@ import pytest
 from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, IndentationTruth, Point, SupervisorState
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import NS, header
 from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
@@ -26,7 +26,7 @@ from palpate_conductor import grants
 from palpate_conductor.collector import Collected, Collector, KeptMessages
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of
+from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of, incomplete
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_errors import UserError
 
@@ -82,6 +82,21 @@ def test_a_pause_has_a_bound_and_is_named() -> None:
             conductor._extend_grant()
         finally:
             close_session(session)
+
+
+@pytest.mark.parametrize("wallclock", [True, False])
+def test_a_planning_that_never_ends_the_examination_ends_the_run_at_its_limit_incomplete(wallclock: bool) -> None:
+    granted: list[tuple[int, bool]] = []
+    limited = grants.Grants(lambda tick, last: granted.append((tick, last)), Timing(wallclock=wallclock, limit=2 * NS))
+    limited.begin()
+    limited.extend(1_400_000_000, None, None)
+    assert not granted[-1][1]
+    limited.extend(1_900_000_000, None, None)
+    assert granted[-1] == (2 * NS, True)
+    scanning = incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_SCAN)]))
+    assert scanning is not None
+    assert (scanning.code, scanning.roles) == (FailureCode.UNENDED, ("planning",))
+    assert incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS)])) is None
 
 
 def test_a_planning_that_never_sends_a_state_is_awaited_for_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
