@@ -30,7 +30,7 @@ from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree
-from palpate_conductor.outcome import RunProgress, RunResult, Timing, incomplete
+from palpate_conductor.outcome import RunProgress, RunResult, Timing, incomplete, unsampled
 from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input
 
@@ -217,6 +217,7 @@ class Lockstep:
 
     def __init__(self, settings: Sequence[str]) -> None:
         scenario = examination(settings)
+        self._exam = scenario.exam
         self._collector = Collector(tree=FrameTree(exam_input(scenario)))
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
         self.twin = run_guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
@@ -249,7 +250,7 @@ class Lockstep:
         failure: Failure | None
         try:
             run.run(end, LIES.longest_ns)
-            failure = incomplete(collected)
+            failure = incomplete(collected) or unsampled(collected, self._exam)
         except ServiceFailed as error:
             failure = error.failure
         log.result = RunResult("composed", collected, sim_time_s=run.t / NS, failure=failure)

@@ -18,6 +18,7 @@ from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, Scores, 
 from palpate.truth.pressed import Pressed, Touched, TrueBody, press_patient
 from palpate_bus import implementations
 from palpate_bus.runs.run_folder import run_of
+from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.settings import Settings
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
@@ -128,6 +129,9 @@ def _unfelt(scenario: Scenario, result: RunResult) -> dict[str, float]:
     exam, region = result.collected.exam, float(np.prod(scenario.exam.region_m))
     if exam is None or not exam.target_count:
         return {Loss.UNFINISHED: region} if result.failure else {}
+    if result.failure is not None and result.failure.code is FailureCode.UNSAMPLED:
+        felt = exam.target_count - exam.targets_skipped
+        return {Loss.FAULT: region * max(felt - len(result.collected.samples), 0) / exam.target_count}
     lost = result.counters.get("planning", {}).get("facts", {}).get("unfelt_targets")
     if lost is None and result.failure and not scenario.exam.searched:  # planning is lost, or the run was recovered
         lost = {Loss.UNFINISHED: exam.target_count - exam.target_index}

@@ -24,7 +24,7 @@ from palpate_bus.runtime.process import rare_collections
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collected, CollectedNews, Collector, FrameTree, collect
-from palpate_conductor.outcome import SIM_LIMIT, Patience, RunProgress, RunResult, Tell, failure_of, incomplete
+from palpate_conductor.outcome import SIM_LIMIT, Patience, RunProgress, RunResult, Tell, failure_of, incomplete, unsampled
 from palpate_errors import RunError, UserError
 from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
 from palpate_models.scenario.schema import Scenario
@@ -229,7 +229,7 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
         wall_time_s=wall,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
-        failure=failure or incomplete(collector.collected),
+        failure=failure or incomplete(collector.collected) or unsampled(collector.collected, scenario.exam),
         lost={**run.lost, **lost},
         interrupted=interrupted,
     )

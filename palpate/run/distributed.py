@@ -15,7 +15,7 @@ from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.handover import REPLACEABLE
-from palpate_conductor.outcome import Patience, RunResult, Tell, Timing
+from palpate_conductor.outcome import Patience, RunResult, Tell, Timing, unsampled
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -83,6 +83,7 @@ def run_distributed(
             at_once = not result.wall_time_s  # it has not begun
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
+            result.failure = result.failure or unsampled(result.collected, scenario.exam)
             return result
         finally:
             close_session(session)

@@ -47,6 +47,8 @@ class FailureCode(StrEnum):
     """Planning aborted the examination."""
     UNENDED = "unended"
     """Planning did not end the examination before the limit of simulated time."""
+    UNSAMPLED = "unsampled"
+    """Targets that planning calls felt were not sampled."""
     UNFINISHED = "unfinished"
     """Recovered from a recording without an end."""
     DAMAGED = "damaged"

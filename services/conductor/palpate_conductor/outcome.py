@@ -10,9 +10,14 @@ from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_errors import RunError
+from palpate_models.scenario.schema import Exam
 
 log = logging.getLogger(__name__)
 
+MIN_SAMPLED = 0.9
+"""Minimum share of the samples that are due; with fewer the examination is not complete."""
+SAMPLE_EVERY_M = 0.01
+"""Travel within which a sample is due [m], twice that of the default assessment."""
 SIM_LIMIT = 3600 * NS
 """Simulated time [ns] after which a run is ended in any case."""
 
@@ -154,3 +159,17 @@ def incomplete(collected: Collected) -> Failure | None:
         return gave_up(collected)
     text = f"planning did not end the examination: {collected.exam.message or 'without a message'}"
     return Failure(FailureCode.UNENDED, text, ("planning",), ("exam/state",))
+
+
+def unsampled(collected: Collected, exam: Exam) -> Failure | None:
+    """Return the failure of an examination that planning calls done, but whose targets were not sampled; None for a search."""
+    last, samples = collected.exam, len(collected.samples)
+    if last is None or last.phase != ExamState.PHASE_DONE or exam.searched:
+        return None
+    felt = int(last.target_count - last.targets_skipped)
+    if samples >= MIN_SAMPLED * felt * min(1.0, exam.spacing_m / SAMPLE_EVERY_M):
+        return None
+    if not samples and any(state.steady for state in collected.exam_states):  # an assessment that publishes none
+        return None
+    text = f"{samples} samples at {felt} targets that planning calls felt: exam/state was not steady, or assessment lost messages"
+    return Failure(FailureCode.UNSAMPLED, text, ("planning", "assessment"), ("exam/state", "assessment/samples"))

@@ -26,9 +26,10 @@ from palpate_conductor import grants
 from palpate_conductor.collector import Collected, Collector, KeptMessages
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of, incomplete
+from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of, incomplete, unsampled
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_errors import UserError
+from palpate_models.scenario.schema import Exam
 
 TOPIC = "truth/indentation"
 
@@ -97,6 +98,18 @@ def test_a_planning_that_never_ends_the_examination_ends_the_run_at_its_limit_in
     assert scanning is not None
     assert (scanning.code, scanning.roles) == (FailureCode.UNENDED, ("planning",))
     assert incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS)])) is None
+
+
+@pytest.mark.parametrize(
+    ("samples", "spacing_m", "complete"), [(0, 0.0125, False), (7, 0.0125, False), (8, 0.0125, True), (4, 0.005, True)]
+)
+def test_targets_that_were_not_sampled_are_not_complete(samples: int, spacing_m: float, complete: bool) -> None:
+    exam = Exam(spacing_m=spacing_m)
+    done = exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS, target_count=9, targets_skipped=1)
+    found = unsampled(Collected([done], samples=[None] * samples), exam)
+    assert (found is None) == complete
+    scanning = exam_state(NS, ExamState.PHASE_SCAN, steady=True)
+    assert unsampled(Collected([scanning, done]), exam) is None, "an assessment need not publish samples"
 
 
 def test_a_planning_that_never_sends_a_state_is_awaited_for_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
