@@ -133,14 +133,16 @@ def indentation(depth_error: float) -> list[Any]:
     ]
 
 
-def collected(depth_error: float = 0.0003, measured_error: float = 0.0, map_too: bool = True) -> Collected:
-    """Return all messages that the conductor collects from a whole run, or from one that ended before its map."""
+def collected(
+    depth_error: float = 0.0003, measured_error: float = 0.0, map_too: bool = True, truth_too: bool = True
+) -> Collected:
+    """Return all messages that the conductor collects from a whole run, or from one that ended before its map or has no truth."""
     vertices, triangles = plane(0.125, 0.005)
     return Collected(
         exam_states=exam_states(measured_error),
-        indentation=indentation(depth_error),
+        indentation=indentation(depth_error) if truth_too else [],
         samples=samples(),
-        phantom=phantom(),
+        phantom=phantom() if truth_too else None,
         surface=mesh(vertices + P_WA + np.array((0.0, 0.0, 0.0005)), triangles, "world"),
         stiffness_map=stiffness_map() if map_too else None,
         findings=findings() if map_too else None,

@@ -13,7 +13,7 @@ from palpate_models.patient.person import PEOPLE, draw_person, under_fat
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.schema import Anatomy, Build, Draw, Muscles, Phantom, Skeleton, Stiffness, Variation
-from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario
+from palpate_models.scenario.load import dump_scenario, load_scenario
 from palpate_models.scenario.schema import Scenario
 
 PERSON = Phantom(kind="person")
@@ -178,6 +178,7 @@ def test_guarding_has_a_measured_ratio() -> None:
         ({"kind": "person", "stiffness": {"k_w_n_per_m3": 1e5}}, "stiffness of kind: person is drawn"),
         ({"kind": "person", "size_m": (0.3, 0.4, 0.2)}, "size_m of kind: person is drawn"),
         ({"kind": "person", "mesh": "a.stl"}, "mesh: FILE needs kind: mesh"),
+        ({"kind": "parametric", "grid": "body.csv"}, "needs kind: grid"),
         ({"kind": "person", "build": "tall"}, "slim"),
         ({"build": "slim"}, "build belongs to kind: person"),
         ({"draw": {"lumps": (1, 2)}}, "draw belongs to kind: person"),
@@ -193,8 +194,3 @@ def test_guarding_has_a_measured_ratio() -> None:
 def test_bad_input_is_refused(fields: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         Phantom.model_validate(fields)
-
-
-def test_bad_input_of_a_scenario_names_the_field() -> None:
-    with pytest.raises(ScenarioError, match=r"--set phantom\.draw\.depth_m: phantom\.draw\.depth_m\.1 = 0\.2: want"):
-        load_scenario("person", ["phantom.draw.depth_m=[0, 0.2]"])

@@ -1,5 +1,6 @@
 """The phantom: surface and stiffness, buried lumps as felt at the skin, and bodies from grid files."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -179,39 +180,30 @@ def test_model_has_surface_and_mechanics_of_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(model.stiffening[inside], 100 + 1e3 * y)
 
 
-def _spoiled(lines: list[str], how: str) -> list[str]:
-    row = lines[5].split(",")
-    changed = {
-        "units": [lines[0].replace("x_m", "x_mm"), *lines[1:]],
-        "gap": lines[:5] + lines[6:],
-        "twice": [*lines, lines[5]],
-        "nan": [*lines[:5], ",".join([*row[:3], "nan", *row[4:]]), *lines[6:]],
-        "soft": [*lines[:5], ",".join([*row[:3], "1", *row[4:]]), *lines[6:]],
-        "moved": [*lines[:5], ",".join([row[0], "0.0013", *row[2:]]), *lines[6:]],
-    }
-    return changed[how]
+def _with(column: int, value: str) -> Callable[[list[str]], list[str]]:
+    """Return a change of one number of a row."""
+    return lambda lines: [
+        *lines[:5],
+        ",".join(value if k == column else n for k, n in enumerate(lines[5].split(","))),
+        *lines[6:],
+    ]
 
 
 @pytest.mark.parametrize(
-    ("how", "named"),
+    ("change", "named"),
     [
-        ("units", "x_mm"),
-        ("gap", "116 rows"),
-        ("twice", "118 rows"),
-        ("nan", "k_w_n_per_m3 = nan"),
-        ("soft", "k_w_n_per_m3 = 1.0"),
-        ("moved", "y_m"),
+        (lambda lines: [lines[0].replace("x_m", "x_mm"), *lines[1:]], "x_mm"),
+        (lambda lines: lines[:5] + lines[6:], "116 rows"),
+        (lambda lines: [*lines, lines[5]], "118 rows"),
+        (_with(3, "nan"), "k_w_n_per_m3 = nan"),
+        (_with(3, "1"), "k_w_n_per_m3 = 1.0"),
+        (_with(1, "0.0013"), "y_m"),
     ],
 )
-def test_unusable_file_is_refused_and_named(tmp_path: Path, how: str, named: str) -> None:
+def test_unusable_file_is_refused_and_named(tmp_path: Path, change: Callable[[list[str]], list[str]], named: str) -> None:
     path = tmp_path / "body.csv"
     _grid().write(path)
-    path.write_text("\n".join(_spoiled(path.read_text().split(), how)))
+    path.write_text("\n".join(change(path.read_text().split())))
     with pytest.raises(MeshError, match=named) as refused:
         read_grid(path)
     assert str(path) in str(refused.value)
-
-
-def test_grid_needs_its_kind() -> None:
-    with pytest.raises(ValueError, match="needs kind: grid"):
-        Phantom(kind="parametric", grid="body.csv")

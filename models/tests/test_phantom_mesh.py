@@ -51,16 +51,6 @@ def test_a_triangle_that_is_there_twice_counts_once(tmp_path):
     assert len(once.vertices) == len(twice.vertices)
 
 
-def test_a_ply_without_triangles_is_refused_for_that(tmp_path):
-    file = tmp_path / "belly.ply"
-    trimesh.Trimesh(*dome(2), process=False).export(file, encoding="ascii")
-    text = file.read_text()
-    file.write_text(text.replace("vertex_indices", "tristrips"))
-    refused(file, "no list vertex_indices")
-    file.write_text(text.replace("property float z\n", ""))
-    refused(file, "no property z")
-
-
 def test_refinement_leaves_no_hanging_vertices():
     vertices, faces = dome(3)
     surface = refine(vertices, faces.astype(np.int32), 0.005)
@@ -118,9 +108,8 @@ QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 CORNERS = [(x, y, z) for x in (-0.2, 0.2) for y in (-0.25, 0.25) for z in (-0.2, 0)]
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
 @pytest.mark.parametrize("kind", ["ply", "ply_ascii", "ply_quads", "stl", "stl_ascii"])
-def test_a_file_that_was_cut_off_is_refused(tmp_path, kind, share):
+def test_a_file_that_was_cut_off_is_refused(tmp_path, kind):
     if kind == "ply_quads":
         content = ply(CORNERS, QUADS)
     elif kind == "ply_ascii":
@@ -131,8 +120,9 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, kind, share):
     path = tmp_path / f"cut.{kind[:3]}"
     path.write_bytes(content)
     build_phantom(Phantom(kind="mesh", mesh=str(path)), 0)
-    path.write_bytes(content[: int(share * len(content))])
-    refused(path, "not whole")
+    for share in (0.3, 0.6, 0.9, 0.99):
+        path.write_bytes(content[: int(share * len(content))])
+        refused(path, "not whole")
 
 
 @pytest.mark.parametrize(
@@ -150,10 +140,18 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, kind, share):
         ("count.ply", ply(BOX.vertices, BOX.faces).replace(b"vertex 8", b"vertex -8"), "is not whole"),
         ("stl.ply", BOX.export(file_type="stl"), "is not whole"),
         ("ply.stl", ply(BOX.vertices, BOX.faces), "not whole, or no STL"),
+        ("x.step", "x", r"want a file in \.obj"),
+        ("junk.ply", b"\x00\x01 no mesh at all", "is not whole"),
+        ("empty.obj", "# nothing\n", "no triangles|cannot be read"),
+        ("points.obj", "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n", "no triangles|cannot be read"),
+        ("strips.ply", ply(BOX.vertices, BOX.faces).replace(b"vertex_indices", b"tristrips"), "no list vertex_indices"),
+        ("flat.ply", ply(BOX.vertices, BOX.faces).replace(b"property float z\n", b""), "no property z"),
+        ("nothing.obj", None, "no such file"),
     ],
 )
 def test_a_file_that_is_not_what_its_header_says_is_refused(tmp_path, name, content, words):
-    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    if content is not None:
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(tmp_path / name, words)
 
 
@@ -211,21 +209,6 @@ def shape(corners):
     """Twice the area over the longest edge squared."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / edges**2
-
-
-def test_missing_and_wrong_files_are_named(tmp_path):
-    refused(tmp_path / "nothing.obj", "no such file")
-    (tmp_path / "x.step").write_text("x")
-    refused(tmp_path / "x.step", r"want a file in \.obj")
-    (tmp_path / "junk.ply").write_bytes(b"\x00\x01 no mesh at all")
-    refused(tmp_path / "junk.ply", "is not whole")
-
-
-def test_empty_mesh_is_refused(tmp_path):
-    (tmp_path / "empty.obj").write_text("# nothing\n")
-    refused(tmp_path / "empty.obj", "no triangles|cannot be read")
-    (tmp_path / "points.obj").write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n")
-    refused(tmp_path / "points.obj", "no triangles|cannot be read")
 
 
 def with_vertex(vertices, faces, vertex):

@@ -12,7 +12,6 @@ import typer
 from rich.text import Text
 from typer.testing import CliRunner
 
-from palpate import commands
 from palpate.commands import COMMANDS, app_for, main
 from palpate.run import examine
 from palpate.run.options import RunOptions
@@ -50,39 +49,6 @@ def test_the_list_of_commands_imports_none_and_describes_each() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[]", "True"]
-
-
-SLOW_TO_IMPORT = {
-    "casadi", "coal", "dartpy", "distributed", "fmpy", "jinja2", "matplotlib", "mcap", "mujoco", "numba", "ompl",
-    "pandas", "PIL", "pinocchio", "plotly", "pyarrow", "rerun", "ruckig", "scipy", "sklearn", "statsmodels", "trimesh",
-}  # fmt: skip
-"""Modules that take a command's help over half a second to import, one or two of them together."""
-
-
-def test_the_help_of_a_command_imports_nothing_slow() -> None:
-    """Each command is imported in a fork of its own."""
-    program = (
-        "import os, sys, traceback\nimport palpate.commands as commands\n"
-        "for name in sorted(commands.COMMANDS):\n"
-        "    if os.fork() == 0:\n"
-        f"        commands.app_for(name); print(name, *sorted({SLOW_TO_IMPORT} & sys.modules.keys()), flush=True); os._exit(0)\n"
-        "    os.wait()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    imported = {name: modules for name, *modules in map(str.split, done.stdout.splitlines())}
-    assert imported == {name: [] for name in sorted(COMMANDS)}, done.stderr
-
-
-def test_a_command_that_lacks_its_libraries_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def absent(name: str) -> None:
-        raise ModuleNotFoundError(f"No module named {name}", name="fmpy")
-
-    monkeypatch.setattr(commands, "import_module", absent)
-    with pytest.raises(SystemExit):
-        app_for("fmu")
-    assert "the command fmu needs fmpy, not installed: pip install 'palpate[fmu]'" in "".join(capsys.readouterr())
 
 
 def test_a_run_without_the_libraries_of_the_dashboard_has_no_dashboard(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ def test_the_surface_in_space_is_the_map(page: str) -> None:
 
 
 def test_a_failed_run_states_its_failure_first(tmp_path: Path) -> None:
-    folder = run_folder(tmp_path, map_too=False, failure="tissue lost at 12.345 s: killed by signal 9")
+    folder = run_folder(tmp_path, map_too=False, truth_too=False, failure="tissue lost at 12.345 s: killed by signal 9")
     page = write_page(folder).read_text(encoding="utf-8")
     assert "did not complete: tissue lost at 12.345 s" in page
     assert "surface-data" not in page
@@ -85,7 +85,7 @@ def test_a_failed_run_states_its_failure_first(tmp_path: Path) -> None:
 
 
 def test_a_run_that_broke_off_did_not_reach_all_targets(tmp_path: Path) -> None:
-    folder = run_folder(tmp_path, failure="tissue lost at 12.345 s: killed by signal 9")
+    folder = run_folder(tmp_path, map_too=False, truth_too=False, failure="tissue lost at 12.345 s: killed by signal 9")
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     (folder / "report.json").write_text(json.dumps({**report, "services": {}, "skipped_targets": 0}), encoding="utf-8")
     page = write_page(folder).read_text(encoding="utf-8")

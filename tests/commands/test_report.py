@@ -145,10 +145,8 @@ def test_clean_worlds(setting: str, clean: bool) -> None:
 
 
 def test_a_real_abdomen_is_assessed_without_a_truth(scenario: Scenario, tmp_path: Path) -> None:
-    real = collected()
-    real.phantom, real.indentation = None, []
     write_scenario_files(scenario, tmp_path)
-    report = write_results(tmp_path, scenario, result(real))
+    report = write_results(tmp_path, scenario, result(collected(truth_too=False)))
     assert report.assessed
     assert report.findings[0].quadrant == "RLQ"
     assert (report.truth, report.scores, report.depth_rms_error_m) == (None, None, None)
@@ -172,7 +170,8 @@ def concluded(folder: Path, scenario: Scenario, messages: Collected) -> None:
 def test_findings_that_break_the_contract_are_reported(
     scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    messages = collected()
+    messages = collected(truth_too=False)
+    messages.stiffness_map = None
     messages.findings.findings[0].confidence = 80.0
     concluded(folder, scenario, messages)
     assert "findings.confidence" in capsys.readouterr().err
@@ -181,7 +180,8 @@ def test_findings_that_break_the_contract_are_reported(
 def test_a_held_arm_is_reported_once_with_the_failure(
     scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    messages = collected()
+    messages = collected(truth_too=False)
+    messages.stiffness_map = None
     why = "emergency stop of the supervisor: planning is silent"
     zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
     held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0, "", zero)
@@ -225,7 +225,7 @@ def test_targets_that_were_not_felt_are_unassessed(
 def test_a_map_that_cannot_be_drawn_leaves_all_other_results(
     scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    messages = collected()
+    messages = collected(truth_too=False)
     messages.stiffness_map.triangles = np.full_like(messages.stiffness_map.triangles, 999_999)
     with pytest.raises(typer.Exit) as left:
         concluded(folder, scenario, messages)

@@ -122,9 +122,9 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
     scenario = load_scenario("clean", SETTINGS, seed=3)
     one, two = tmp_path / "one", tmp_path / "two"
     reports = []
-    for folder in (one, two):
+    for folder, map_too in ((one, True), (two, False)):
         write_scenario_files(scenario, folder)
-        reports.append(write_results(folder, scenario, result(collected())))
+        reports.append(write_results(folder, scenario, result(collected(map_too=map_too, truth_too=False))))
     write_page(one)
     run = run_of(one)
     assert len(run) == 12
@@ -189,7 +189,7 @@ def test_results_that_a_folder_does_not_take_go_to_another_or_to_the_console(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / other))
     scenario = load_scenario("clean", SETTINGS, seed=3)
     with pytest.raises(typer.Exit) as left:
-        conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected()), quiet=True)
+        conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected(truth_too=False)), quiet=True)
     assert left.value.exit_code == ExitStatus.FAILED
     out, err = capsys.readouterr()
     assert "RLQ" in out

@@ -47,8 +47,10 @@ def wrench(t: int) -> Any:
 class SmallRobot:
     """Publishes `joint_states` and `ft/wrench` in ticks of 1 ms, one per 5 ms, and its description."""
 
-    def __init__(self, bus: zenoh.Session) -> None:
+    def __init__(self, bus: zenoh.Session, endpoint: str) -> None:
         self.bus = bus
+        self.given = "--connect", endpoint, "--domain", str(DOMAIN)
+        """Options that name the bus, on which a command does not wait for the roles of a run."""
         self.change: Callable[[Any], Any] = lambda message: message
         """Changes a joint state before it is sent."""
         self._tokens = tokens = NodeTokens(bus, "robot", DOMAIN)  # kept, because tokens are withdrawn with their last reference
@@ -103,7 +105,7 @@ def robot() -> Iterator[SmallRobot]:
         announced = Run(name="small", endpoints={"robot": options.listen[0], **absent}, domain=DOMAIN)
         with session(options) as bus:
             announcement = Announcement(announced)
-            small = SmallRobot(bus)
+            small = SmallRobot(bus, options.listen[0])
             yield small
             small.stop.set()
             small.thread.join()
@@ -115,14 +117,14 @@ def test_topics_of_the_announced_bus(robot: SmallRobot) -> None:
     assert set(rows) == {"joint_states", "ft/wrench", "robot_description"}
     assert rows["joint_states"]["publishers"] == ["robot"]
     assert all(row["matches_contract"] for row in rows.values())
-    assert "joint_states" in run("topic", "list").stdout
+    assert "joint_states" in run("topic", "list", *robot.given).stdout
 
 
 def test_info_shows_the_row_and_its_endpoints(robot: SmallRobot) -> None:
     facts = output_of("topic", "info", "/ft/wrench")
     assert facts["contract"]["frame"] == "ft_sensor"
     assert [(end["node"], end["kind"]) for end in facts["endpoints"]] == [("robot", "publisher")]
-    assert "[N] -200 .. 200" in run("topic", "info", "ft/wrench").stdout
+    assert "[N] -200 .. 200" in run("topic", "info", "ft/wrench", *robot.given).stdout
 
 
 def test_echo_prints_what_is_sent(robot: SmallRobot) -> None:

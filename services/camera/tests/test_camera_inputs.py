@@ -163,38 +163,6 @@ def test_wrong_images_are_refused_at_the_start(camera: Camera, tmp_path: Path, f
         camera(seen, tmp_path / "recording_mcap")
 
 
-@both
-@pytest.mark.parametrize("encoding", ["32FC1", "16UC1", "mono16"])
-@pytest.mark.parametrize("order", "<>")
-def test_either_byte_order_and_padded_rows_are_read(camera: Camera, tmp_path: Path, encoding: str, order: str) -> None:
-    seen = Seen()
-    pixels = np.full((HEIGHT, WIDTH), 0.75, f"{order}f4") if encoding == "32FC1" else np.full((HEIGHT, WIDTH), 750, f"{order}u2")
-    rows = np.full((HEIGHT, pixels.itemsize * WIDTH + 6), 7, np.uint8)
-    rows[:, :-6] = pixels.view(np.uint8)
-    seen.image.encoding, seen.image.step, seen.image.is_bigendian = encoding, rows.shape[1], int(order == ">")
-    seen.image.data = rows.ravel()
-    image = shown(camera(seen, tmp_path / "recording_mcap"))
-    np.testing.assert_allclose(np.frombuffer(image.data, "<f4"), 0.75)
-
-
-@both
-@pytest.mark.parametrize("encoding", ["32FC1", "16UC1"])
-def test_0_65535_and_nan_are_no_measurement(camera: Camera, tmp_path: Path, encoding: str) -> None:
-    seen = Seen()
-    pixels = np.full((HEIGHT, WIDTH), 750, "<u2")
-    pixels[0, :2] = 0, 65535
-    if encoding == "32FC1":
-        pixels = pixels.astype("<f4") / 1000
-        pixels[0, 2] = np.nan
-    seen.image.encoding, seen.image.step = encoding, pixels.itemsize * WIDTH
-    seen.image.data = pixels.view(np.uint8).ravel()
-    image = shown(camera(seen, tmp_path / "recording_mcap"))
-    depth = np.frombuffer(image.data, "<f4").reshape(HEIGHT, WIDTH)
-    assert (image.encoding, image.header.frame_id) == ("32FC1", FRAME)
-    assert np.isnan(depth[0]).tolist() == [True, True, encoding == "32FC1", False, False, False, False, False]
-    np.testing.assert_allclose(depth[1:], 0.75)
-
-
 FOREIGN = [
     link("world", "gripper", (0.0, 0.0, 0.0, 0.0)),
     link("map", "marker", (NAN,) * 4),

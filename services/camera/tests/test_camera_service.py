@@ -94,21 +94,6 @@ def test_the_small_image_is_as_noisy_as_the_whole_one() -> None:
     assert small == pytest.approx(whole, rel=0.1)
 
 
-def test_an_ideal_camera_measures_the_plate_and_the_table() -> None:
-    service = CameraService(plant_input(scenario(camera={"noise_scale": 0.0})))
-    sent = service.step(0, HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1)}))
-    image = depth(sent["camera/depth/image_raw"])
-    camera = Scenario().camera
-    X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
-    rows, columns = np.nonzero(np.isfinite(image))
-    direction = np.column_stack(((columns - 319.5) / 585, (rows - 239.5) / 585, np.ones(len(rows))))
-    p_W = direction * image[rows, columns, np.newaxis] @ X_WC[:3, :3].T + X_WC[:3, 3]
-    heights = p_W[:, 2]
-    assert np.mean(np.abs(heights - 0.9) < 1e-4) > 0.05  # the plate
-    assert np.mean(np.abs(heights - 0.73) < 1e-4) > 0.2  # the table's top
-    assert heights.max() < Scenario().robot.base_height_m + 1e-4  # the highest thing without an arm
-
-
 def test_images_use_the_true_pose_and_messages_the_calibrated_one() -> None:
     """A camera that is truly 4 cm farther back measures the plate 4 cm farther away, and publishes the same pose."""
     calm = {"camera": {"noise_scale": 0.0}}

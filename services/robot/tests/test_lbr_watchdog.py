@@ -30,11 +30,17 @@ from palpate_robot.backends.watchdog import TIMEOUT_NS, Watchdog
 PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-def dead_driver(watched: bool) -> Emulator:
-    """Return the arm 0.6 s after a driver that pushed has died."""
+def commanding() -> Emulator:
+    """Return an arm whose session takes commands."""
     emulator = Emulator(plant_input(load_scenario("clean")))
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
+    return emulator
+
+
+def dead_driver(watched: bool) -> Emulator:
+    """Return the arm 0.6 s after a driver that pushed has died."""
+    emulator = commanding()
     watchdog = lbr_watchdog()
     for cycle in range(400):
         t = 2 * MS * cycle
@@ -59,9 +65,7 @@ def test_without_it_the_arm_goes_on_and_with_it_it_stands() -> None:
 
 def started() -> Watchdog:
     watchdog = lbr_watchdog()
-    emulator = Emulator(plant_input(load_scenario("clean")))
-    while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
-        emulator.cycle()
+    emulator = commanding()
     watchdog.state(0, emulator.state(1))
     watchdog.command(0, b"first")
     return watchdog
@@ -83,9 +87,7 @@ def test_the_old_driver_does_not_get_the_arm_back_a_new_one_does() -> None:
 
 
 def test_a_driver_that_died_before_the_watchdog_began_leaves_no_push() -> None:
-    watchdog, emulator = lbr_watchdog(), Emulator(plant_input(load_scenario("clean")))
-    while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
-        emulator.cycle()
+    watchdog, emulator = lbr_watchdog(), commanding()
     for t in range(0, TIMEOUT_NS + 3 * MS, 2 * MS):
         watchdog.state(t, emulator.state(1 + t))
     assert watchdog.decide(TIMEOUT_NS + 3 * MS) is not None
