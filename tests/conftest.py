@@ -14,16 +14,12 @@ from examination import GATE, TINY, Finished, palpate_run
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-FUSED = (*TINY, "phantom.edge_m=0.005", "camera.frames=10")
-"""A tiny examination on a fine mesh, whose surface is perceived to a millimetre."""
+FUSED = (*TINY, "exam.region_m=[0.0125, 0.03]", "phantom.edge_m=0.005", "camera.frames=8")
+"""An examination of two lines on a fine mesh, whose surface is perceived to a millimetre."""
 LONG_FILES = (
-    "test_runtimes.py",
-    "test_search.py",
-    "test_validation.py",
-    "test_fmu_build.py",
-    "test_patient_seen.py",
-    "test_library.py",
-)
+    "test_fmu_build.py", "test_resumption.py", "test_validation.py", "test_runtimes.py", "test_search.py", "test_patient_seen.py",
+    "test_library.py", "test_perception_following.py", "test_quick.py", "test_twin.py", "test_foreign_code.py", "test_services.py",
+)  # fmt: skip
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
 
@@ -46,17 +42,21 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 
 GATE_FILE = "test_gate.py"
-EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py")
-"""Files that share examinations. One worker runs them all, so that each examination runs once."""
+EXAMINATION_FILES = (GATE_FILE, "test_examination.py", "test_contract_ros_tools.py")
+"""Files that share examinations. One worker runs them all, so that each examination runs once.
+
+The examination in one process comes first: it compiles what the processes of another one would compile at the same time.
+"""
 LONG_S = 1200
 """Time for a test with whole examinations [s], on a machine that others load too."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long tests begin first, and have a longer timeout."""
-    items.sort(key=lambda item: (item.path.name not in EXAMINATION_FILES, item.path.name not in LONG_FILES))
+    order = {name: place for place, name in enumerate((*EXAMINATION_FILES, *LONG_FILES))}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
     for item in items:
-        if item.path.name in (*EXAMINATION_FILES, *LONG_FILES):
+        if item.path.name in order:
             item.add_marker(pytest.mark.timeout(LONG_S))
 
 

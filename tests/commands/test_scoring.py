@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import cache
 
+import conductor_messages
 import numpy as np
 import pytest
 
@@ -21,14 +22,9 @@ NOWHERE = Touched(np.empty((0, 3)), np.empty((0, 3)))
 
 
 def plane(half: float = 0.14, pitch: float = 0.005, slope: float = 0.0) -> tuple[Array, np.ndarray]:
-    n = round(2 * half / pitch) + 1
-    axis = np.linspace(-half, half, n)
-    x, y = np.meshgrid(axis, axis)
-    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    triangles = np.concatenate(
-        (np.column_stack((corner, corner + 1, corner + n + 1)), np.column_stack((corner, corner + n + 1, corner + n)))
-    )
-    return np.column_stack((x.ravel(), y.ravel(), slope * x.ravel())), triangles.astype(np.int32)
+    vertices, triangles = conductor_messages.plane(half, pitch)
+    vertices[:, 2] = slope * vertices[:, 0]
+    return vertices, triangles.astype(np.int32)
 
 
 def factor(xy: Array, disc: Disc, contrast: float) -> Array:

@@ -97,7 +97,7 @@ def missing() -> str | None:
     return None
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def engine() -> Iterator[None]:
     if why := missing():
         pytest.skip(f"needs a Docker engine with compose: {why}")

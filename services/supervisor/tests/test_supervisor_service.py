@@ -114,48 +114,52 @@ def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
     assert not any(forces((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)))
 
 
+WEIGHT = KNOWN.robot.tool_mass_kg * GRAVITY
+STRAIGHT_DOWN = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+"""Where the F/T sensor reads the weight of the tool at home."""
+
+
+def sensed(sense: ToolSense, wrench: np.ndarray, qd: float = 0.0) -> Tool:
+    """Return what is known of the tool at home after another reading."""
+    return sense.sense(Measurement(np.array(lbr.HOME), np.full(7, qd), wrench, HOLDING), 0.01)
+
+
 def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
     sense = ToolSense(KNOWN.robot)
-    q = np.array(lbr.HOME)
-    weight = KNOWN.robot.tool_mass_kg * GRAVITY
-    hanging = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])  # tool straight down: +z reads its weight
-    tool = sense.sense(Measurement(q, np.zeros(7), hanging, HOLDING), 0.01)
-    assert tool.force == pytest.approx(0.0, abs=0.01)
-    pressed = sense.sense(Measurement(q, np.zeros(7), hanging - np.array([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]), HOLDING), 0.01)
-    assert pressed.force == pytest.approx(7.0, abs=0.01)
+    assert sensed(sense, WEIGHT * STRAIGHT_DOWN).force == pytest.approx(0.0, abs=0.01)
+    assert sensed(sense, (WEIGHT - 7.0) * STRAIGHT_DOWN).force == pytest.approx(7.0, abs=0.01)
 
 
 def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
     sense = ToolSense(KNOWN.robot)
-    q, still, slow = np.array(lbr.HOME), np.zeros(7), np.full(7, 0.05)
-    hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
-    bias = np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.0])
+    biased = WEIGHT * STRAIGHT_DOWN + (3.0, -2.0, 1.0, 0.0, 0.0, 0.0)
     for noise in (0.2, -0.2):
-        sense.sense(Measurement(q, still, hanging + bias + noise, HOLDING), 0.01)
-    assert sense.sense(Measurement(q, slow, hanging + bias, HOLDING), 0.01).force == pytest.approx(0.0, abs=1.2), "a jerk"
-    pressed = hanging + bias - np.array([0.0, 0.0, 9.0, 0.0, 0.0, 0.0])
-    assert sense.sense(Measurement(q, still, pressed, HOLDING), 0.01).force == pytest.approx(9.0, abs=0.01), (
-        "a tool that has moved may be pressed at rest"
-    )
+        sensed(sense, biased + noise)
+    assert sensed(sense, biased, qd=0.05).force == pytest.approx(0.0, abs=1.2), "a jerk"
+    pressed = sensed(sense, biased - 9.0 * STRAIGHT_DOWN)
+    assert pressed.force == pytest.approx(9.0, abs=0.01), "a tool that has moved may be pressed at rest"
 
 
 def test_a_bias_at_the_start_is_neither_a_disagreement_nor_a_gain() -> None:
     sense = ToolSense(KNOWN.robot)
-    reading = np.array([3.0, -2.0, 1.0 + KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
     for _ in range(6):
-        sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), reading, HOLDING), 0.01)
+        sensed(sense, WEIGHT * STRAIGHT_DOWN + (3.0, -2.0, 1.0, 0.0, 0.0, 0.0))
     assert sense.comparison.disagreement == pytest.approx(0.0, abs=0.01)
     assert sense.comparison.excitation == pytest.approx(0.0, abs=0.01)
 
 
 def test_a_drift_while_the_arm_waits_is_no_bias() -> None:
     sense = ToolSense(KNOWN.robot)
-    hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
-    drift = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
     for n in range(600):
-        tool = sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), hanging + n * drift, HOLDING), 0.01)
+        tool = sensed(sense, (WEIGHT + 0.01 * n) * STRAIGHT_DOWN)
     assert tool.force == pytest.approx(5.5, abs=0.1)
     assert sense.comparison.drift > 3.5
+
+
+def test_a_press_before_the_arm_moves_is_no_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    for _ in range(3):
+        assert sensed(sense, (WEIGHT - 9.0) * STRAIGHT_DOWN).force == pytest.approx(9.0, abs=0.01)
 
 
 def test_a_sensor_that_was_found_wrong_explains_an_earlier_stop() -> None:
@@ -163,15 +167,6 @@ def test_a_sensor_that_was_found_wrong_explains_an_earlier_stop() -> None:
     latch = latch_after([force], [force, Breach(Level.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")])
     assert (latch.level, latch.cause, latch.culprit) == (Level.EMERGENCY, StopCause.SENSOR, "ft/wrench")
     assert "external force 30 N" in latch.reason
-
-
-def test_a_press_before_the_arm_moves_is_no_bias() -> None:
-    sense = ToolSense(KNOWN.robot)
-    pressed = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY - 9.0, 0.0, 0.0, 0.0])
-    for _ in range(3):
-        assert sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), pressed, HOLDING), 0.01).force == pytest.approx(
-            9.0, abs=0.01
-        )
 
 
 def test_speed_is_that_of_the_sphere() -> None:

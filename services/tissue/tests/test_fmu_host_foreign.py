@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from foreign_fmu import build_lag
 from scipy.spatial.transform import Rotation
+from tissue_messages import Source, pose, tool_state
 
 from palpate_bus.contract import Contract, contract, parse
-from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages import PoseStamped
 from palpate_bus.messages.codec import decode, encode
+from palpate_bus.messages.geometry import vectors
 from palpate_bus.messages.stamps import MS, NS, header
 from palpate_bus.runtime.composed import Composed
-from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.testing import HandInbox
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.reading import FmuError
@@ -46,21 +48,12 @@ def chosen(scenario: Scenario, **fields: str) -> Scenario:
     return scenario.model_copy(update={"tissue": TissueChoice(**fields), "services": services})
 
 
-class Playback:
-    def __init__(self) -> None:
-        self.tool: Any = None
-
-    def latest(self, topic: str) -> Any:
-        return self.tool if topic == "sim/tool_state" else None
-
-
 def tool(scenario: Scenario, k: int) -> Any:
     """Return a slide down into the lesion, in world."""
     X_WA = matrix(true_pose(scenario))
     p = X_WA[:3, :3] @ np.array((-0.07 + 2e-5 * k, -0.055, 0.012 - 4e-5 * k)) + X_WA[:3, 3]
     v = X_WA[:3, :3] @ np.array((0.02, 0.0, -0.04))
-    pose = Pose(Point(*p.tolist()), Quaternion(0.0, 0.0, 0.0, 1.0))
-    return ToolState(header(k * MS, "world"), pose, Twist(Vector3(*v.tolist()), Vector3(0.1, 0.2, 0.3)), 0.015)
+    return tool_state(k * MS, p, v, (0.1, 0.2, 0.3))
 
 
 def flat(message: Any, prefix: str = "") -> dict[str, Any]:
@@ -95,10 +88,10 @@ def test_it_sends_what_the_native_tissue_sends(version: int, scenario: Scenario,
     begin, expected = service.start(), native_tissue.start()
     assert begin.keys() == expected.keys()
     assert_alike("truth/phantom", begin["truth/phantom"], expected["truth/phantom"])
-    inbox, peak = Playback(), 0.0
+    inbox, peak = HandInbox(), 0.0
     for k in range(600):
-        inbox.tool = tool(scenario, k)
-        ours, theirs = service.step(k * MS, inbox), native_tissue.step(k * MS, inbox)  # type: ignore[arg-type]
+        inbox.messages["sim/tool_state"] = tool(scenario, k)
+        ours, theirs = service.step(k * MS, inbox), native_tissue.step(k * MS, inbox)
         assert ours.keys() == theirs.keys()
         for topic in ours:
             rest = version == 2 and topic == "sim/surface"
@@ -125,12 +118,12 @@ def test_a_map_of_ones_own_is_read_from_the_scenario(scenario: Scenario, tmp_pat
     path = tmp_path / "map.yaml"
     with resources.as_file(resources.files("palpate_tissue.backends.fmu") / "maps" / "tissue.yaml") as packaged:
         path.write_text(packaged.read_text(encoding="utf-8") + "parameters: {friction: 0.0, stiffness_scale: 2.0}\n")
-    inbox, forces = Playback(), []
+    inbox, forces = HandInbox(), []
     for case in (chosen(scenario), chosen(scenario, fmu_map=str(path))):
         service = create(case)
         for k in range(300):
-            inbox.tool = tool(scenario, k)
-            sent = service.step(k * MS, inbox)  # type: ignore[arg-type]
+            inbox.messages["sim/tool_state"] = tool(scenario, k)
+            sent = service.step(k * MS, inbox)
         forces.append(sent["sim/contact_wrench"].wrench.force.z)  # type: ignore[union-attr]
         service.finish()
     assert forces[1] > 1.5 * forces[0] > 0
@@ -177,21 +170,6 @@ X_W_BODY[:3, 3] = (0.1, -0.2, 0.3)
 FRAMES = {"world": np.eye(4), "body": X_W_BODY}
 
 
-class Source(Service):
-    """A point that jumps at 0.1 s, and the follower as it was seen."""
-
-    role = "source"
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[float, float, float]] = []
-
-    def step(self, t: int, inbox: Inbox) -> Outbox:
-        for message in inbox.new("follower"):
-            self.seen.append((message.point.x, message.point.y, message.point.z))
-        x = 0.2 if t >= NS // 10 else 0.0
-        return {"place": PoseStamped(header(t, "world"), Pose(Point(x, 0.1, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0)))}
-
-
 @pytest.fixture(scope="module")
 def lag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_lag(tmp_path_factory.mktemp("lag"))
@@ -209,7 +187,8 @@ def table(tmp_path: Path, text: str = MAP) -> FmuMap:
 
 
 def run(lag: Path, rules: Contract, chosen: FmuMap) -> tuple[Source, str, list[Any]]:
-    source, sent = Source(), []
+    """Run a point that jumps at 0.1 s and the FMU."""
+    source, sent = Source("follower", lambda t: (0.2 if t >= NS // 10 else 0.0, 0.1, 0.0)), []
     composed = Composed(
         [source, host("lag", lag, chosen, FRAMES, rules=rules)],
         rules,
@@ -229,7 +208,7 @@ def test_it_follows_with_its_own_time_constant_in_the_topics_frame_and_unit(lag:
         y = y + share * (u[k] - y)
         if k % 2 == 0:
             expected.append(y)
-    np.testing.assert_allclose(source.seen, expected, atol=1e-12)
+    np.testing.assert_allclose(vectors([message.point for message in source.seen]), expected, atol=1e-12)
     assert len(source.seen) == 25
     assert [stamp for name, stamp, _ in sent if name == "speed"] == [0]
     assert run(lag, rules, table(tmp_path))[1] == digest
@@ -238,15 +217,13 @@ def test_it_follows_with_its_own_time_constant_in_the_topics_frame_and_unit(lag:
 def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contract, tmp_path: Path) -> None:
     """On a wall clock a tick can be left out; this FMU takes steps of 10 ms only."""
 
-    class Still:
-        def latest(self, _topic: str) -> Any:
-            return PoseStamped(header(0, "world"), Pose(Point(0.2, 0.1, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0)))
-
+    still = HandInbox()
+    still.messages["place"] = PoseStamped(header(0, "world"), pose((0.2, 0.1, 0.0)))
     places = []
     for ticks in ((0, 1, 2, 3, 4), (0, 4)):
         service = host("lag", lag, table(tmp_path), FRAMES, rules=rules)
         for k in ticks:
-            sent = service.step(k * NS // 100, Still())  # type: ignore[arg-type]
+            sent = service.step(k * NS // 100, still)
         point = sent["follower"].point  # type: ignore[union-attr]
         places.append((point.x, point.y, point.z))
         service.finish()
@@ -290,13 +267,8 @@ def test_a_unit_of_another_dimension_is_refused(lag: Path, tmp_path: Path) -> No
 def test_an_fmu_that_fails_names_itself_and_the_step(lag: Path, rules: Contract, tmp_path: Path) -> None:
     odd = parse(RULES.replace("lag: {period_ms: 10", "lag: {period_ms: 20"))
     service = host("lag", lag, table(tmp_path), FRAMES, rules=odd)
-
-    class Empty:
-        def latest(self, _topic: str) -> None:
-            return None
-
     with pytest.raises(FmuError, match=r"lag\.fmu: step from 0 s by 0\.02 s: fmi3Error"):
-        service.step(0, Empty())  # type: ignore[arg-type]
+        service.step(0, HandInbox())
 
 
 def test_a_file_that_is_no_fmu_is_refused(rules: Contract, tmp_path: Path) -> None:

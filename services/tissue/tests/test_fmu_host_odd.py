@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from odd_fmu import Odd, build_wall, description
+from tissue_messages import Source
 
 from palpate_bus.contract import Contract, parse
-from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed, ServiceFailed
-from palpate_bus.service import Inbox, Outbox, Service
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.reading import FmuError
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError
@@ -36,17 +35,6 @@ def rules() -> Contract:
     return parse(RULES)
 
 
-class Source(Service):
-    role = "source"
-
-    def __init__(self) -> None:
-        self.seen: list[float] = []
-
-    def step(self, t: int, inbox: Inbox) -> Outbox:
-        self.seen += [message.wrench.force.z for message in inbox.new("force")]
-        return {"place": PoseStamped(header(t, ""), Pose(Point(0.0, 0.0, 0.945 - 1e-9 * t), Quaternion(0.0, 0.0, 0.0, 1.0)))}
-
-
 def table(odd: Odd = Odd.NOTHING, at: float = 0.0, force: str = "f", **more: object) -> FmuMap:
     raw = {
         "role": "wall",
@@ -58,11 +46,11 @@ def table(odd: Odd = Odd.NOTHING, at: float = 0.0, force: str = "f", **more: obj
 
 
 def run(service: FmuService, rules: Contract) -> list[float]:
-    source = Source()
+    source = Source("force", lambda t: (0.0, 0.0, 0.945 - 1e-9 * t))
     composed = Composed([source, service], rules)
     composed.run(lambda: None, NS // 10)
     composed.finish()
-    return source.seen
+    return [message.wrench.force.z for message in source.seen]
 
 
 @VERSIONS

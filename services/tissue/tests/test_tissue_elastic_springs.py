@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tissue_messages import tool_state
 
 from palpate_bus.contract import contract
 from palpate_bus.implementations import kind
-from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages.stamps import MS
 from palpate_bus.testing import HandInbox
 from palpate_models.patient import wall
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
@@ -150,11 +150,6 @@ def test_no_closed_cycle_yields_work(stiffening: float, tension: float, dashpot_
 
 
 COARSE = ("phantom.edge_m=0.012", "phantom.lesions.0.depth_m=0.02", "phantom.lesions.0.radii_m=[0.06, 0.05]")
-
-
-def tool_state(t, p, radius=0.015):
-    pose = Pose(Point(*p), Quaternion(0.0, 0.0, 0.0, 1.0))
-    return ToolState(header(t, "world"), pose, Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), radius)
 
 
 def test_the_scenario_chooses_it():

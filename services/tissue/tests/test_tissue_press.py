@@ -28,8 +28,12 @@ PLACES = np.array(((0.0, 0.0, 0.0), (0.012, 0.003, 0.0), (-0.04, 0.03, 0.0)))
 UP = np.tile((0.0, 0.0, 1.0), (3, 1))
 
 
+def body() -> PhantomModel:
+    return flat_phantom(0.13, 0.006, lesions=(LESION,))
+
+
 def winkler() -> WinklerTissue:
-    return WinklerTissue(flat_phantom(0.13, 0.006, lesions=(LESION,)))
+    return WinklerTissue(body())
 
 
 def elastic() -> ElasticTissue:
@@ -37,7 +41,7 @@ def elastic() -> ElasticTissue:
 
 
 def voluntary() -> WinklerTissue:
-    return WinklerTissue(tense(flat_phantom(0.13, 0.006, lesions=(LESION,))))
+    return WinklerTissue(tense(body()))
 
 
 def voluntary_elastic() -> ElasticTissue:
@@ -108,10 +112,6 @@ RADIUS = 0.015
 BREATHING = BreathingCurve(Breathing(), 3)
 
 
-def body() -> PhantomModel:
-    return flat_phantom(0.13, 0.006, lesions=(Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.015), contrast=4.0),))
-
-
 def track(model: PhantomModel, breathing: BreathingCurve, dt: float) -> tuple[Array, Array]:
     """Along a line, back on the next one, and a stand: times [s] and centres [m] of the sphere, each `dt` [s]."""
     t = dt * np.arange(1, round(6.0 / dt) + 1)
@@ -145,11 +145,9 @@ def test_forces_are_those_of_the_explicit_steps(breathing: BreathingCurve) -> No
 
 
 def test_a_press_feels_the_same() -> None:
-    explicit = WinklerTissue(body())
-    places = np.array(((0.0, 0.0, 0.0), (0.012, 0.003, 0.0), (-0.04, 0.03, 0.0)))
-    up = np.tile((0.0, 0.0, 1.0), (3, 1))
-    wanted, _ = explicit.press(places, up, RADIUS)
-    felt, _ = explicit.in_steps_of(0.010).press(places, up, RADIUS)
+    explicit = winkler()
+    wanted, _ = explicit.press(PLACES, UP, RADIUS)
+    felt, _ = explicit.in_steps_of(0.010).press(PLACES, UP, RADIUS)
     assert felt == pytest.approx(wanted, rel=5e-3)
 
 

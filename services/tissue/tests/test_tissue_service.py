@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tissue_messages import tool_state
 
-from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages import ToolState
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import pose_matrix
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages.stamps import MS
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import apply, matrix
@@ -27,11 +28,6 @@ from palpate_tissue.moving import MovingBody
 from palpate_tissue.surface import SkinSurface, nearest_on_triangles
 
 LESION = Lesion(centre_m=(-0.02, 0.0))
-
-
-def tool_state(t, p, v=(0.0, 0.0, 0.0), radius=0.015):
-    pose = Pose(Point(*p), Quaternion(0.0, 0.0, 0.0, 1.0))
-    return ToolState(header(t, "world"), pose, Twist(Vector3(*v), Vector3(0.0, 0.0, 0.0)), radius)
 
 
 def scenario(**phantom):
