@@ -26,17 +26,17 @@ def test_codec(by: str) -> None:
     codec.time_decode()
 
 
-@pytest.mark.parametrize("wall", ["linear", "guarding"])
-def test_a_step_on_the_abdomen(wall: str) -> None:
-    abdomen = benchmarks("tissue").Abdomen()
-    abdomen.setup("surface", wall)
-    abdomen.time_step()
-    assert abdomen.track_contacts() > 5
-
-
-@pytest.mark.parametrize("tier", ["surface", "elastic"])
-def test_a_step_on_a_flat_patch(tier: str) -> None:
-    patch = benchmarks("tissue").FlatPatch()
-    patch.setup(tier, 700)
-    patch.time_step()
-    assert len(patch.body.contacts) > 3
+@pytest.mark.parametrize(
+    ("tissue", "case"),
+    [
+        ("Abdomen", ("surface", "linear")),
+        ("Abdomen", ("surface", "guarding")),
+        ("FlatPatch", ("surface", 700)),
+        ("FlatPatch", ("elastic", 700)),
+    ],
+)
+def test_a_step_of_the_tissue(tissue: str, case: tuple[str, str | int]) -> None:
+    pressed = getattr(benchmarks("tissue"), tissue)()
+    pressed.setup(*case)
+    pressed.time_step()
+    assert len(pressed.body.contacts) > 3

@@ -56,19 +56,15 @@ def test_a_snake_is_one_stroke_without_corners() -> None:
     assert stroke.xy[:, 0].max() < 5 * SPACING + 0.6 * SPACING
 
 
-def test_a_skipped_target_breaks_the_stroke() -> None:
+def test_a_skipped_target_breaks_the_stroke_and_a_break_keeps_its_targets() -> None:
     xy, lines = grid(5, 2, snake=True)
-    usable = np.ones(len(xy), dtype=bool)
-    usable[2] = False
-    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING)
-    assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [3, 4, 5, 6, 7, 8, 9]]
-
-
-def test_a_break_ends_a_stroke_but_keeps_its_targets() -> None:
-    xy, lines = grid(5, 2, snake=True)
-    usable = np.ones(len(xy), dtype=bool)
-    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING, {1, 4})
-    assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [2, 3, 4], [5, 6, 7, 8, 9]]
+    for skipped, breaks, expected in (
+        ([2], set[int](), [[0, 1], [3, 4, 5, 6, 7, 8, 9]]),
+        ([], {1, 4}, [[0, 1], [2, 3, 4], [5, 6, 7, 8, 9]]),
+    ):
+        usable = ~np.isin(np.arange(len(xy)), skipped)
+        pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING, breaks)
+        assert [piece.targets.tolist() for piece in pieces] == expected
 
 
 def test_raster_has_a_stroke_a_line_and_point_mode_one_a_target() -> None:
