@@ -16,9 +16,9 @@ from palpate_bus.messages import (
     Pose,
     Quaternion,
     StiffnessMap,
-    SurfaceMesh,
     Vector3,
 )
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
@@ -42,9 +42,7 @@ def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh(vertices: np.ndarray, triangles: np.ndarray, frame: str) -> Any:
-    return SurfaceMesh(
-        header(0, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
-    )
+    return mesh_message(header(0, frame), vertices, triangles=triangles)
 
 
 def phantom() -> Any:

@@ -29,7 +29,6 @@ from palpate_bus.messages import (
     Quaternion,
     String,
     SupervisorState,
-    SurfaceMesh,
     TFMessage,
     ToolState,
     Twist,
@@ -37,6 +36,7 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import MS, NS, blank, duration_message, header
 from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
@@ -128,8 +128,7 @@ class Tissue(Service):
     role = "tissue"
 
     def start(self) -> Outbox:
-        none = np.zeros(0, np.float32)
-        mesh = SurfaceMesh(header(0, "abdomen"), np.zeros(3, np.float32), none, np.zeros(0, np.uint32), np.empty(0, np.float32))
+        mesh = mesh_message(header(0, "abdomen"), np.zeros(3))
         return {"truth/phantom": PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -143,10 +142,7 @@ class Tissue(Service):
             out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
         if t % (50 * MS) == 0:
             out["truth/patient"] = PatientTruth(h, 0.0, pose())
-            vertices = np.full(9000, x, np.float32)
-            out["sim/surface"] = SurfaceMesh(
-                h, vertices, np.zeros(0, np.float32), np.zeros(18000, np.uint32), np.empty(0, np.float32)
-            )
+            out["sim/surface"] = mesh_message(h, np.full(9000, x), triangles=np.zeros(18000))
         return out
 
 
@@ -211,12 +207,7 @@ class Perception(Service):
         images = list(inbox.new("camera/depth/image_raw"))
         if not images:
             return {}
-        level = np.full(3, float(images[-1].data[0]), np.float32)
-        return {
-            "perception/surface": SurfaceMesh(
-                header(t, "world"), level, np.zeros(0, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
-            )
-        }
+        return {"perception/surface": mesh_message(header(t, "world"), np.full(3, float(images[-1].data[0])))}
 
 
 class Supervisor(Service):

@@ -17,7 +17,6 @@ from palpate_bus.messages import (
     ExamState,
     Finding,
     Findings,
-    Image,
     IndentationTruth,
     KeyValue,
     PalpationTargets,
@@ -25,22 +24,23 @@ from palpate_bus.messages import (
     PatientTruth,
     PhantomTruth,
     Point,
-    PointCloud2,
-    PointField,
     Pose,
     PoseStamped,
     Quaternion,
     RobotStatus,
     StiffnessMap,
-    SurfaceMesh,
-    TFMessage,
-    Transform,
-    TransformStamped,
     Vector3,
-    Wrench,
     codec,
 )
-from palpate_bus.messages.geometry import camera_info
+from palpate_bus.messages.geometry import (
+    camera_info,
+    cloud_message,
+    depth_message,
+    frames_message,
+    mesh_message,
+    point_message,
+    wrench_message,
+)
 from palpate_bus.messages.stamps import header, time_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
@@ -89,9 +89,7 @@ def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
-    return SurfaceMesh(
-        header(t, frame), vertices.astype(np.float32).ravel(), np.empty(0, np.float32), triangles.ravel(), np.empty(0, np.float32)
-    )
+    return mesh_message(header(t, frame), vertices, triangles=triangles)
 
 
 def pose(position: Array, rotation: Rotation | None = None) -> Any:
@@ -100,11 +98,7 @@ def pose(position: Array, rotation: Rotation | None = None) -> Any:
 
 
 def transforms(t: int, poses: dict[str, tuple[Array, Rotation]]) -> Any:
-    items = [
-        TransformStamped(header(t, "world"), link, Transform(Vector3(*map(float, p)), Quaternion(*map(float, r.as_quat()))))
-        for link, (p, r) in poses.items()
-    ]
-    return TFMessage(items)
+    return frames_message(header(t, "world"), list(poses), np.array([(*p, *r.as_quat()) for p, r in poses.values()]))
 
 
 def ratio_field(vertices: NDArray[np.float32]) -> Array:
@@ -134,31 +128,21 @@ def look(t: int) -> Messages:
     frame = "camera_depth_optical_frame"
     vertices, triangles = dome()
     world = (vertices + X_WA).astype(np.float32)
-    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
     cloud = world.repeat(5, axis=0)
     cloud[0] = np.nan
-    packed = np.ascontiguousarray(cloud).view(np.uint8).ravel()
     targets = world[(np.abs(vertices[:, :2]) < 0.1).all(axis=1)][::3]
+    above = targets + np.array((0.0, 0.0, 0.02))
     return {
         "camera/depth/camera_info": camera_info(header(t, frame), (480, 640), k),
-        "camera/depth/image_raw": Image(header(t, frame), 480, 640, "32FC1", 0, 2560, image.view(np.uint8).ravel()),
-        "perception/points": PointCloud2(header(t, "world"), 1, len(cloud), fields, False, 12, 12 * len(cloud), packed, False),
+        "camera/depth/image_raw": depth_message(header(t, frame), image),
+        "perception/points": cloud_message(header(t, "world"), cloud),
         "perception/surface": surface(t, world, triangles, "world"),
         "perception/targets": PalpationTargets(
-            header(t, "world"),
-            [Point(*map(float, p)) for p in targets],
-            [Vector3(0.0, 0.0, 1.0)] * len(targets),
-            np.zeros(len(targets), np.uint32),
-            0.001,
-            20,
-            1.0,
-            0,
-            "",
+            header(t, "world"), [point_message(p) for p in targets], [Vector3(0.0, 0.0, 1.0)] * len(targets),
+            np.zeros(len(targets), np.uint32), 0.001, 20, 1.0, 0, "",
         ),
-        "planning/path": Path(
-            header(t, "world"), [PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets]
-        ),
-    }
+        "planning/path": Path(header(t, "world"), [PoseStamped(header(t, "world"), pose(p)) for p in above]),
+    }  # fmt: skip
 
 
 def stiffness_map(t: int, share: float) -> Any:
@@ -179,8 +163,8 @@ def findings(t: int) -> Any:
 
 def robot_status(t: int, torque: Array) -> Any:
     """The rest of the message is not drawn."""
-    zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
-    return RobotStatus(header(t), 1, 0, "", zero, zero, wrench, torque, 0, "", torque)
+    zero = np.zeros(7)
+    return RobotStatus(header(t), 1, 0, "", zero, zero, wrench_message(zero), torque, 0, "", torque)
 
 
 def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:

@@ -18,8 +18,8 @@ from palpate.report.results import Known, assemble, clean_world, print_findings,
 from palpate.report.rows import Report
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
-from palpate_bus.messages import ExamState, RobotStatus, Vector3, Wrench
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import ExamState, RobotStatus
+from palpate_bus.messages.stamps import blank
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import gave_up
@@ -183,8 +183,7 @@ def test_a_held_arm_is_reported_once_with_the_failure(
     messages = collected(truth_too=False)
     messages.stiffness_map = None
     why = "emergency stop of the supervisor: planning is silent"
-    zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
-    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0, "", zero)
+    held = replace(blank("palpation_msgs/msg/RobotStatus", 17_830_000_000), mode=RobotStatus.MODE_SAFE_HOLD, reason=why)
     messages.status_changes.append(held)
     lost, gave_up = Failure(FailureCode.ROLE_LOST, "planning lost"), Failure(FailureCode.GAVE_UP, f"aborted: {why}")
     aborted = {"phase": ExamState.PHASE_ABORTED, "reason": ExamState.REASON_EMERGENCY_STOP}

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.messages import CameraTrigger, SurfaceMesh
+from palpate_bus.messages import CameraTrigger
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.errors import (
@@ -136,10 +137,8 @@ def photograph(frames: int = 1, seed: int = 0, **given: float) -> np.ndarray:
     """Depth images [m] of a flat patient on the table, shape (frames, height, width)."""
     errors = Errors(level="none", camera=CameraErrors(**given))
     camera, inbox = CameraService(plant_input(Scenario(seed=seed, errors=errors))), HandInbox()
-    vertices = np.array([(0.41, -0.15, 0.9), (0.71, -0.15, 0.9), (0.71, 0.15, 0.9), (0.41, 0.15, 0.9)], np.float32)
-    surface = SurfaceMesh(
-        header(0, "world"), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]), np.empty(0, np.float32)
-    )
+    vertices = ((0.41, -0.15, 0.9), (0.71, -0.15, 0.9), (0.71, 0.15, 0.9), (0.41, 0.15, 0.9))
+    surface = mesh_message(header(0, "world"), vertices, triangles=(0, 1, 2, 0, 2, 3))
     inbox.receive({"sim/surface": surface, "planning/camera_trigger": CameraTrigger(header(0), frames)})
     sent: list[Any] = [camera.step(0, inbox)]
     sent += [camera.step(k * 100 * MS, inbox.receive({})) for k in range(1, frames)]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage
+from palpate_bus.messages import CameraTrigger, TFMessage
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.scene import Mesh, Scene
@@ -26,10 +27,8 @@ def scenario(**errors: Any) -> Scenario:
 def plate(height: float = 0.9, half: float = 0.15, frame: str = "world") -> Any:
     """Return a horizontal square at the patient's place."""
     corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
-    vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height))).astype(np.float32)
-    return SurfaceMesh(
-        header(0, frame), vertices.ravel(), np.empty(0, np.float32), np.uint32([0, 1, 2, 0, 2, 3]), np.empty(0, np.float32)
-    )
+    vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height)))
+    return mesh_message(header(0, frame), vertices, triangles=(0, 1, 2, 0, 2, 3))
 
 
 def trigger(frames: int, t: int = 0) -> Any:

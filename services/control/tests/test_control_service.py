@@ -1,12 +1,13 @@
 """The control service: what it sends before, with, and after set-points."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus, Twist, Vector3, Wrench
-from palpate_bus.messages.stamps import MS, duration_message, header, nanoseconds
+from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus
+from palpate_bus.messages.stamps import MS, blank, duration_message, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create
@@ -22,13 +23,9 @@ def joints(t: int, q: np.ndarray = HOME, names: tuple[str, ...] = JOINT_NAMES) -
 
 
 def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_JOINT, **changes: Any) -> Any:
-    none = Vector3(0.0, 0.0, 0.0)
     fields = {
-        "header": header(t, "world"),
         "mode": mode,
         "pose": Pose(Point(0.3, 0.0, 1.5), Quaternion(1.0, 0.0, 0.0, 0.0)),
-        "twist": Twist(none, none),
-        "wrench": Wrench(none, none),
         "stiffness": np.full(6, 200.0),
         "damping_ratio": np.full(6, 0.8),
         "joint_position": np.array(HOME) + 0.1,
@@ -36,12 +33,12 @@ def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_J
         "joint_stiffness": np.full(7, 500.0),
         "valid_for": duration_message(valid),
     }
-    return ImpedanceSetpoint(**(fields | changes))
+    return replace(blank("palpation_msgs/msg/ImpedanceSetpoint", t, "world"), **(fields | changes))
 
 
 def status(t: int) -> Any:
-    none, zero = Vector3(0.0, 0.0, 0.0), np.zeros(7)
-    return RobotStatus(header(t), RobotStatus.MODE_ACTIVE, 0, "", np.array(HOME), zero, Wrench(none, none), zero, 0, "", zero)
+    rest = dict.fromkeys(("velocity", "applied_torque", "measured_torque"), np.zeros(7))
+    return replace(blank("palpation_msgs/msg/RobotStatus", t), mode=RobotStatus.MODE_ACTIVE, position=np.array(HOME), **rest)
 
 
 class Rig:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_bus.messages import CameraTrigger, SurfaceMesh, SurfaceMotion, TFMessage
+from palpate_bus.messages import CameraTrigger, SurfaceMotion, TFMessage
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
@@ -36,10 +37,7 @@ def scenario(*settings: str, seed: int = 0) -> Scenario:
 def skin(case: Scenario, rise: float = 0.0) -> Any:
     """sim/surface of the phantom at rest, lifted by `rise` [m]."""
     p_W = apply(matrix(true_pose(case)), phantom().vertices) + np.array((0, 0, rise))
-    triangles = phantom().triangles.astype(np.uint32).ravel()
-    return SurfaceMesh(
-        header(0, "world"), p_W.astype(np.float32).ravel(), np.empty(0, np.float32), triangles, np.empty(0, np.float32)
-    )
+    return mesh_message(header(0, "world"), p_W, triangles=phantom().triangles)
 
 
 @cache

@@ -7,7 +7,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
+from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
@@ -362,11 +363,8 @@ def test_a_measurement_that_is_only_repeated_is_silence() -> None:
 
 @pytest.mark.parametrize(("vertices", "normals"), [(4, 6), (6, 5), (6, 9), (9, 6)])
 def test_an_invalid_surface_stops_softly_and_ends_no_process(vertices: int, normals: int) -> None:
-    mesh = SurfaceMesh(
-        header(0), np.zeros(vertices, np.float32), np.zeros(normals, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
-    )
     inbox = HandInbox()
-    inbox.events["perception/surface"] = [mesh]
+    inbox.events["perception/surface"] = [mesh_message(header(0), np.zeros(vertices), np.zeros(normals))]
     state: Any = create(load_scenario("healthy")).step(0, inbox)["supervisor/state"]
     assert (state.level, state.cause) == (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.CAUSE_INVALID)
     assert "perception/surface" in state.reason
