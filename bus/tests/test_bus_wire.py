@@ -1,12 +1,11 @@
 """rmw_zenoh's wire format: keys, attachments, liveliness tokens."""
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import zenoh.ext as ze
 from hypothesis import given, strategies as st
+from waiting import wait_until
 
 from palpate_bus.contract import contract
 from palpate_bus.wire import rmw as wire
@@ -115,15 +114,6 @@ def test_a_different_definition_is_named_with_both_sides() -> None:
         assert part in sentence
 
 
-def _until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
-
-
 def test_watch_sees_roles_come_and_go_and_late_joiners_see_all(tmp_path: Path) -> None:
     options = mesh(["robot", "control"], tmp_path, lowlatency=("robot", "control"))
     topic = RULES.topics["joint_states"]
@@ -133,14 +123,14 @@ def test_watch_sees_roles_come_and_go_and_late_joiners_see_all(tmp_path: Path) -
             tokens = NodeTokens(robot, "robot", domain=5)
             publisher_gid = tokens.publisher(topic, RULES.qos[topic.qos])
             seen = []
-            assert _until(lambda: bool(seen.extend(watch.changes()) or len(watch.alive) == 2))
+            assert wait_until(lambda: bool(seen.extend(watch.changes()) or len(watch.alive) == 2))
             assert all(appeared for _, appeared in seen)
             assert watch.roles() == {"robot"}
             assert publisher_gid in {entity.gid for entity in watch.alive.values()}
             late = GraphWatch(watching, domain=5)
-            assert _until(lambda: bool(late.changes() or len(late.alive) == 2))
+            assert wait_until(lambda: bool(late.changes() or len(late.alive) == 2))
             assert {entity.kind for entity in late.alive.values()} == {EntityKind.NODE, EntityKind.PUBLISHER}
             NodeTokens(robot, "elsewhere", domain=6)
-        assert _until(lambda: bool(watch.changes() or watch.gone() == {"robot"}))
+        assert wait_until(lambda: bool(watch.changes() or watch.gone() == {"robot"}))
         assert watch.roles() == frozenset()
         watch.close()

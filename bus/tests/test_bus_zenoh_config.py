@@ -1,5 +1,6 @@
 """Connections between processes: settings of the environment, options, meshes, routers, the end of sessions."""
 
+import os
 import socket
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from queue import Empty, SimpleQueue
 
 import pytest
 import zenoh
+from waiting import wait_until
 
 from palpate_bus.contract import parse, with_periods
 from palpate_bus.settings import Settings
@@ -111,10 +113,7 @@ def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
         with session(BusOptions(router=endpoint, mode="client")) as client:
             assert received(a, client) == b"x"
             assert received(client, b) == b"x"
-        end = time.monotonic() + 10
-        while b.zid() not in a.info.peers_zid() and time.monotonic() < end:
-            time.sleep(0.01)
-        assert b.zid() in a.info.peers_zid()
+        assert wait_until(lambda: b.zid() in a.info.peers_zid())
         assert close_session(router)
         assert received(a, b, key="test/after") == b"x"
 
@@ -131,13 +130,10 @@ def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:
     )
     with session(options["a"]) as a:
         child = subprocess.Popen(
-            [sys.executable, "-c", program], env={**__import__("os").environ, **options["b"].to_env()}, stdout=subprocess.PIPE,
+            [sys.executable, "-c", program], env={**os.environ, **options["b"].to_env()}, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        end = time.monotonic() + 60
-        while child.poll() is None and time.monotonic() < end:
-            a.put("k/a", "hello")
-            time.sleep(0.01)
+        assert wait_until(lambda: a.put("k/a", "hello") or child.poll() is not None, 60)
         out, error = child.communicate(timeout=60)
     assert (child.returncode, out.strip()) == (0, "hello")
     assert "panic" not in error
@@ -155,10 +151,7 @@ def test_a_closed_session_keeps_no_shared_memory(tmp_path: Path) -> None:
         assert received(a, b, bytes(200_000)) is not None
         assert mapped() > before
     del a, b
-    end = time.monotonic() + 10
-    while mapped() > before and time.monotonic() < end:
-        time.sleep(0.05)
-    assert mapped() <= before, "what earlier tests left may be gone, too"
+    assert wait_until(lambda: mapped() <= before), "what earlier tests left may be gone, too"
 
 
 SETTINGS = {

@@ -5,11 +5,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from time import monotonic, sleep
+from time import sleep
 from typing import Any
 
 import psutil
 import pytest
+from waiting import wait_until
 
 from palpate.run.folder import unless_begun
 from palpate.run.interrupts import all_is_measured, results_first
@@ -95,14 +96,11 @@ def services_of(pid: int) -> list[psutil.Process]:
 def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     run = start(out)
-    until = monotonic() + PATIENCE_S
-    while not services_of(run.pid) and monotonic() < until:
-        sleep(0.02)
+    assert wait_until(lambda: services_of(run.pid), PATIENCE_S)
     sleep(0.5)  # some are importing by now
     services = services_of(run.pid)
     run.send_signal(signal.SIGINT)
     _, said = run.communicate(timeout=PATIENCE_S)
-    assert services
     assert not any(service.is_running() for service in services)
     assert run.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both
     assert said.splitlines()[-1] == "palpate: interrupted"

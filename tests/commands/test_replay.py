@@ -12,6 +12,7 @@ import zenoh
 from click.testing import Result
 from mcap.writer import Writer
 from typer.testing import CliRunner
+from waiting import wait_until
 
 from palpate.commands import app_for
 from palpate.replay.compare import Tolerance, compare
@@ -180,12 +181,9 @@ def test_every_message_arrives_as_it_was_recorded(endpoint: str, listener: zenoh
         listener.declare_subscriber(topic_key(RULES.topics[name], 0), zenoh.handlers.Callback(queue.put, indirect=False))
     watch, roles = GraphWatch(listener, 0), {"robot", "planning", "control", "conductor"}
     with Player(recording, rate=0.5, listen=endpoint) as player:
-        deadline = time.monotonic() + 20
-        while not listener.info.peers_zid() and time.monotonic() < deadline:
-            time.sleep(0.02)
+        assert wait_until(listener.info.peers_zid)
         time.sleep(0.3)  # the subscriptions reach the player
-        while not watch.roles() >= roles and time.monotonic() < deadline:
-            watch.changes(0.1)
+        assert wait_until(lambda: watch.changes() == [] and watch.roles() >= roles)
         begin = time.monotonic()
         player.play()
         assert time.monotonic() - begin >= 2 * recording.last / 1e9
