@@ -130,14 +130,6 @@ def test_the_truth_goes_with_the_patient(recording: Recording) -> None:
         assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z + sent.excursion), abs=1e-6)
 
 
-def test_curves_have_twenty_points_a_second(recording: Recording) -> None:
-    rows = recording.cells("/plots/force/measured", "Scalars:scalars")
-    assert len(rows) == SECONDS * 20
-    times = np.array([time for time, _ in rows])
-    assert np.diff(times) == pytest.approx(0.05)
-    assert len(recording.cells("/plots/torque/joints", "Scalars:scalars")[0][1]) == 7
-
-
 def test_the_abdomen_is_written_only_while_it_changes(recording: Recording) -> None:
     rows = recording.cells("/world/abdomen", "Mesh3D:vertex_positions")
     pressed = [time for time, _ in rows if time > 0.1]
