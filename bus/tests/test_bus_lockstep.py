@@ -103,7 +103,7 @@ def test_a_lost_producer_blocks_no_reader() -> None:
     ("role", "change", "said"),
     [
         ("robot", lambda t, out: {k: v for k, v in out.items() if k != "ft/wrench"}, "robot sent no ft/wrench at 0 ns"),
-        ("control", lambda t, out: {"ft/wrench": None}, "control sent ft/wrench"),
+        ("camera", lambda t, out: {"ft/wrench": None}, "camera sent ft/wrench"),
         ("robot", lambda t, out: {**out, "robot/status": None} if t else out, "not a multiple of its period"),
     ],
 )
