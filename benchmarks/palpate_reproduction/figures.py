@@ -137,9 +137,9 @@ def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
         raise ValueError("the run has no truth to compare with")
     figure = _figure(10.5, 4.6)
     left, right = figure.subplots(1, 2)
-    small = "true apparent stiffness; dashed: palpable part of the lump, solid: finding"
+    small = f"true apparent stiffness; {drawing.truth_legend}"
     drawing.panel(left, drawing.stiffness_layer(drawing.true), "a", "The model", small, truth=True)
-    small = "estimated apparent stiffness; solid: finding"
+    small = f"estimated apparent stiffness; {drawing.outlined}"
     drawing.panel(right, drawing.stiffness_layer(drawing.map.apparent), "b", "The palpation", small, labels=True)
     _save(figure, path)
     known = drawing.map.scanned & np.isfinite(drawing.true)

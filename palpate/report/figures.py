@@ -24,7 +24,6 @@ from palpate_models.numerics.maps import half_width
 INK = "#1b2a33"
 QUIET = "#6b7a83"
 FORCE_COLOURS, STIFFNESS_COLOURS, UNCERTAINTY_COLOURS = "viridis", "inferno", "cividis"
-WHERE_FELT = "dashed: where a lump is felt; solid: finding"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
 APPARENT = "force of the standard press"
@@ -59,6 +58,7 @@ class Drawing:
         self.depth = float(message.common_depth)
         self.background = float(message.background)
         self.findings = [] if findings is None else list(findings.findings)
+        self.outlined = "findings outlined" if self.findings else "no finding"
         xyz = self.map.vertices * 1e3
         triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
         triangles = triangles[self.map.scanned[triangles].all(axis=1)]
@@ -72,6 +72,8 @@ class Drawing:
             places = truth.touched.places(self.map.vertices[:, :2])
             self.true = truth.felt.force(places)
             self.lump = truth.felt.in_lump(places).astype(float)
+        lump = "dashed: where a lump is felt" if self.lump is not None and self.lump.any() else "no lump"
+        self.truth_legend = f"{lump}; {'solid: finding' if self.findings else self.outlined}"
 
     @property
     def apparent_norm(self) -> LogNorm:
@@ -239,7 +241,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples_xy: Array) 
 def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
     layer = drawing.stiffness_layer(drawing.map.apparent)
     flat = figure.add_subplot(grid[1, 0])
-    small = f"{APPARENT}; background {drawing.background:.1f} N; finding outlined"
+    small = f"{APPARENT}; background {drawing.background:.1f} N; {drawing.outlined}"
     drawing.panel(flat, layer, "d", "Apparent stiffness, estimated", small, labels=True)
     solid = figure.add_subplot(grid[1, 1], projection="3d")
     drawing.space(solid, drawing.xyz[:, 2], layer, "z [mm]")
@@ -250,7 +252,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
         true.set_axis_off()
         true.text(0.5, 0.5, "truth unknown", ha="center", va="center", color=QUIET, fontsize=13)
         return
-    drawing.panel(true, drawing.stiffness_layer(drawing.true), "f", "Apparent stiffness, true", WHERE_FELT, truth=True)
+    drawing.panel(true, drawing.stiffness_layer(drawing.true), "f", "Apparent stiffness, true", drawing.truth_legend, truth=True)
 
 
 def panel_title(axes: Any, letter: str, title: str, small: str) -> None:

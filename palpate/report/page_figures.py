@@ -91,7 +91,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool
     skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
     small = f"{len(samples_xy)} samples (dots){skipped}"
     drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.3g} mm", small)
-    small = "times the background; findings outlined"
+    small = f"times the background; {drawing.outlined}"
     drawing.panel(middle, _ratio_layer(drawing), "b", "Apparent stiffness", small, labels=True)
     drawing.panel(right, drawing.spread_layer, "c", "Uncertainty", "half width of the 90 % band of the apparent stiffness")
     return _png(figure)
@@ -147,7 +147,7 @@ def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
         return None
     figure = _figure(10.4, 5.0)
     left, right = figure.subplots(1, 2)
-    drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", figures.WHERE_FELT, truth=True)
+    drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", drawing.truth_legend, truth=True)
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
     layer = figures.MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")

@@ -13,7 +13,7 @@ from conductor_messages import SETTINGS, collected, findings, result, stiffness_
 from matplotlib.image import imread
 
 from palpate.report import archive
-from palpate.report.figures import draw_map
+from palpate.report.figures import Drawing, draw_map
 from palpate.report.page import verdict, write_page
 from palpate.report.results import Known, assemble, truth_of_run, write_results
 from palpate.report.rows import Report
@@ -177,3 +177,6 @@ def test_the_map_is_drawn_with_or_without_findings_and_truth(found: bool, known:
     assert image[..., :3].std() > 0.15
     outline = np.abs(image[..., :3] - (0x18 / 255, 0xE0 / 255, 0xD0 / 255)).max(axis=-1) < 0.02
     assert outline.sum() > 400 if found else outline.sum() < 50
+    drawing = Drawing(stiffness_map(), shown, truth if known else None)
+    assert drawing.outlined == ("findings outlined" if found else "no finding")
+    assert drawing.truth_legend == f"no lump; {'solid: finding' if found else 'no finding'}"
