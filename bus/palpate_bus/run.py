@@ -103,7 +103,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         with rare_collections():
             node.run()
         for member in members.values():
-            member.leave()
+            member.close()
         status = 0
     except RunAborted as aborted:
         log.warning("run ended early: %s", aborted)

@@ -156,7 +156,7 @@ class LiveRig(Rig):
         """Abort an implementation that still runs, and leave the bus."""
         self._say(RunControl.ABORT, reason="the conformance check is over")
         for member in self._members.values():
-            member.leave()
+            member.close()
         self.graph.close()
         for reader in self._readers.values():
             reader.close()

@@ -118,7 +118,7 @@ class Member:
     def _update(self) -> None:
         self._changed = bool(self.graph.changes()) or self._changed
 
-    def leave(self) -> None:
-        """Withdraw the tokens."""
+    def close(self) -> None:
+        """Leave the bus: withdraw the tokens."""
         self._tokens.undeclare()
         self.graph.close()
