@@ -86,6 +86,10 @@ BROKEN = {
     "no mesh": ({"collision": '<geometry><mesh filename="no.stl"/></geometry>'}, "link link_3: mesh no.stl is not there"),
     "no limits": ({"limit": "<unlimited/>"}, "joint joint_3: no limit"),
     "empty range": ({"limit": '<limit lower="1" upper="1" velocity="2" effort="80"/>'}, "joint joint_3: its range"),
+    "range within the margins": (
+        {"limit": '<limit lower="-0.05" upper="0.05" velocity="2" effort="80"/>'},
+        "joint joint_3: its range is -0.05 to 0.05 rad, want more than 0.1 rad",
+    ),
     "no speed": ({"limit": '<limit lower="-1" upper="1" velocity="0" effort="80"/>'}, "joint joint_3: velocity_radps is 0"),
     "no torque": ({"limit": '<limit lower="-1" upper="1" velocity="2" effort="0"/>'}, "joint joint_3: torque_nm is 0"),
     "slides": ({"kind": "prismatic"}, "joint joint_3: is prismatic"),

@@ -23,6 +23,7 @@ from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_posture
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
+from palpate_models.scenario.schema import Limits
 
 
 class ArmTuning(NamedTuple):
@@ -294,8 +295,8 @@ class _Reader(UrdfTree):
                 else:
                     table[row, k] = self.numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
-            if not upper > lower:
-                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad")
+            if not upper - lower > (least := 2 * Limits().joint_margin_rad):
+                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad, want more than {least:g} rad")
             for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
                 if not value > 0:
                     self.faults.append(f"joint {name}: {field} is {value:g}, want more than 0")
