@@ -179,7 +179,7 @@ class Recording:
         first = next(self.messages(topics), None)
         return 0 if first is None or first.stamp < UNIX_NS else first.stamp
 
-    def check(self, rules: Contract, topics: Collection[str], *, whole: bool = True) -> None:
+    def check(self, contract: Contract, topics: Collection[str], *, whole: bool = True) -> None:
         """Raise RecordingError if a topic was recorded with another type or definition than the contract's.
 
         With `whole`, also if not every message of a topic was kept.
@@ -188,7 +188,7 @@ class Recording:
             if whole and name in self.thinned:
                 kept = f"only one message of topic {name} per {self.thinned[name]} ms was kept, but all are needed"
                 raise RecordingError(f"{self.path}: {kept}; record with --record full")
-            if name in self.types and (difference := self.types[name].difference(rules.topics[name])):
+            if name in self.types and (difference := self.types[name].difference(contract.topics[name])):
                 advice = "record again, or replay with the version that recorded it"
                 raise RecordingError(f"{self.path}: topic {name} was recorded {difference}; {advice}")
 

@@ -47,12 +47,12 @@ def _node(
     """Return the node of a process. Raises BusConfigError if one of several services needs a process of its own."""
     first = services[0]
     member = members[first.role]
-    apart = [service.role for service in services if runtime != "lockstep" or member.rules.roles[service.role].observer]
+    apart = [service.role for service in services if runtime != "lockstep" or member.contract.roles[service.role].observer]
     if not apart:
         return LockstepNode(services, members)
     if len(services) > 1:
         raise BusConfigError(f"{', '.join(apart)} need their own process in {runtime} mode; the group is {', '.join(members)}")
-    if not member.rules.roles[first.role].observer:
+    if not member.contract.roles[first.role].observer:
         return WallClockNode(first, member)
     return RecorderNode(first, member) if isinstance(first, RawRecorder) else ObserverNode(first, member)
 
@@ -89,15 +89,14 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         handler = logging.StreamHandler()
         handler.setFormatter(PrintableFormatter(f"%(asctime)s {name} %(levelname)s %(message)s"))
         logging.basicConfig(level=settings.log, handlers=[handler])
-        rules = contract()
         here = hosted()
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that open files are closed
         services = [one.make() for one in here]
-        if all(in_background(rules.roles[one.role], settings.runtime) for one in here):
+        if all(in_background(contract().roles[one.role], settings.runtime) for one in here):
             run_in_background()
         sessions = {options: open_session(options) for options in dict.fromkeys(one.options for one in here)}
         carriers = {options: transport(session) for options, session in sessions.items()}
-        bus = rules, settings.domain
+        bus = contract(), settings.domain
         members = {one.role: Member(sessions[one.options], one.role, *bus, carriers[one.options]) for one in here}
         node = _node(services, members, settings.runtime)
         with rare_collections():

@@ -85,7 +85,7 @@ class Bus:
     role = "recorder"
 
     def __init__(self, *commands: RunControl) -> None:
-        self.rules = contract()
+        self.contract = contract()
         self.conductor_there = bool(commands)
         self.commands = [codec.encode(command, CONTROL_TYPE) for command in commands]
         self.reports: list[ServiceReport] = []

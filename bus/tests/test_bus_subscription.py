@@ -58,7 +58,6 @@ def test_a_key_is_readable_to_its_owner_only(tmp_path: Path) -> None:
 
 
 def test_messages_that_move_the_arm_or_conduct_are_tagged() -> None:
-    rules = contract()
     for name in (
         "control/joint_torque",
         "planning/setpoint",
@@ -67,9 +66,9 @@ def test_messages_that_move_the_arm_or_conduct_are_tagged() -> None:
         "palpate/report/robot",
         "operator/request",
     ):
-        assert rules.tagged(name)
-    assert not rules.tagged("palpate/record/robot")
-    assert not rules.tagged("nothing")
+        assert contract().tagged(name)
+    assert not contract().tagged("palpate/record/robot")
+    assert not contract().tagged("nothing")
 
 
 OURS, STRANGER = b"o" * 16, b"s" * 16

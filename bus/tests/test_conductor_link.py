@@ -45,7 +45,7 @@ class Bus:
         monkeypatch.setenv("PALPATE_RUNTIME", runtime)
         monkeypatch.setattr(conductor_link, "monotonic", lambda: self.now)
         monkeypatch.setattr(conductor_link, "is_running", lambda pid: self.runs and pid == PID)
-        self.rules = contract()
+        self.contract = contract()
         self.now = 100.0
         self.runs = False
         self.token = True

@@ -7,6 +7,7 @@
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
+from functools import partial
 from heapq import heappop, heappush
 from itertools import groupby
 from pathlib import Path
@@ -137,9 +138,8 @@ def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Sess
 
 def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
     """Draw `run` until it ends, and forward operator `keys`. Returns how the run ended."""
-    rules, key = contract(), run.read_key()
-    name = f"viewer_{os.getpid()}"
-    with session(run.options()) as bus, _operator(run, bus) as operator, closing(Member(bus, name, rules, run.domain)) as member:
+    key, member_of = run.read_key(), partial(Member, role=f"viewer_{os.getpid()}", contract=contract(), domain=run.domain)
+    with session(run.options()) as bus, _operator(run, bus) as operator, closing(member_of(bus)) as member:
         control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
         decode = codec.decoder("palpation_msgs/msg/RunControl")
         observed = ObservedService(service, member)  # collects live messages while the past is drawn

@@ -3,7 +3,7 @@
 from collections.abc import Container, Iterable
 
 from generate import table
-from palpate_bus.contract import Contract, Edge, Qos, Role, Visibility, contract
+from palpate_bus.contract import Contract, Edge, Qos, Role, Visibility, contract as default_contract
 
 _HEAD = """\
 # Topics
@@ -25,21 +25,21 @@ _EDGES = {
 }
 
 
-def page(rules: Contract | None = None) -> str:
+def page(contract: Contract | None = None) -> str:
     """Return the page of a contract, by default the project's."""
-    rules = rules or contract()
-    senders = {role.name: role for role in rules.roles.values() if rules.outputs(role.name)}
-    parts = [_HEAD, _delays(rules), _secrets(rules), _qos(rules.qos.values())]
-    parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
-    parts.append(_internal(rules))
+    contract = contract or default_contract()
+    senders = {role.name: role for role in contract.roles.values() if contract.outputs(role.name)}
+    parts = [_HEAD, _delays(contract), _secrets(contract), _qos(contract.qos.values())]
+    parts += [_roles(contract.roles.values(), senders), *(_producer(contract, role) for role in senders.values())]
+    parts.append(_internal(contract))
     return "\n".join(parts)
 
 
-def _delays(rules: Contract) -> str:
+def _delays(contract: Contract) -> str:
     """Return every one-period delay, since users of a co-simulation mistake them for bugs."""
     rows = []
-    for topic in rules.topics.values():
-        period = rules.roles[topic.producer].period_ms
+    for topic in contract.topics.values():
+        period = contract.roles[topic.producer].period_ms
         readers = [role for role, edge in topic.readers.items() if edge is Edge.PREVIOUS]
         if readers:
             rows.append((f"`{topic.name}`", topic.producer, ", ".join(readers), f"{period} ms"))
@@ -50,10 +50,10 @@ def _delays(rules: Contract) -> str:
     return text + table(("topic", "from", "to", "delay"), rows)
 
 
-def _secrets(rules: Contract) -> str:
+def _secrets(contract: Contract) -> str:
     rows = [
         (f"`{topic.name}`", topic.visibility.value, topic.producer, ", ".join(topic.readers))
-        for topic in rules.topics.values()
+        for topic in contract.topics.values()
         if topic.visibility is not Visibility.PUBLIC
     ]
     text = (
@@ -86,19 +86,19 @@ def _roles(roles: Iterable[Role], senders: Container[str]) -> str:
     return "## Roles\n\n" + table(("role", "steps every", "task", ""), rows)
 
 
-def _producer(rules: Contract, role: Role) -> str:
+def _producer(contract: Contract, role: Role) -> str:
     parts = [f"## {role.name}\n", f"{role.doc[0].upper()}{role.doc[1:]}; steps every {role.period_ms} ms.\n"]
-    inputs = [(f"`{topic.name}`", topic.producer, _EDGES[edge]) for topic, edge in rules.inputs(role.name)]
+    inputs = [(f"`{topic.name}`", topic.producer, _EDGES[edge]) for topic, edge in contract.inputs(role.name)]
     if inputs and not role.observer:
         parts += ["Reads:\n", table(("topic", "from", "when"), inputs)]
-    for topic in rules.outputs(role.name):
+    for topic in contract.outputs(role.name):
         parts += [f"### `{topic.name}`\n", topic.doc + ".\n", table(("", ""), topic.facts())]
     return "\n".join(parts)
 
 
-def _internal(rules: Contract) -> str:
+def _internal(contract: Contract) -> str:
     rows = []
-    for row in rules.internal.values():
+    for row in contract.internal.values():
         every = "" if row.period_ms is None else f"{row.period_ms} ms"
         deadline = "" if row.deadline_ms is None else f"{row.deadline_ms} ms"
         tagged = "yes" if row.tagged else ""

@@ -63,13 +63,13 @@ class LiveRig(Rig):
         self._session = session
         self._domain = domain
         self.graph = GraphWatch(session, domain)
-        producers = {"conductor", *(topic.producer for topic, _ in self.rules.inputs(role))}
+        producers = {"conductor", *(topic.producer for topic, _ in self.contract.inputs(role))}
         transport = Transport(session)
-        self._members = {name: Member(session, name, self.rules, domain, transport) for name in sorted(producers)}
-        self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.rules.inputs(role)}
+        self._members = {name: Member(session, name, self.contract, domain, transport) for name in sorted(producers)}
+        self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.contract.inputs(role)}
         self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL_TYPE, "event")
         self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
-        self._readers = {topic.name: every_sender(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._readers = {topic.name: every_sender(session, topic, domain) for topic in self.contract.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
         self._last_control = 0.0
@@ -127,7 +127,7 @@ class LiveRig(Rig):
         ours = str(self._session.zid())
         ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
         sent = {e.endpoint.topic: e.endpoint for e in ends if e.kind is EntityKind.PUBLISHER and e.endpoint is not None}
-        for topic in self.rules.outputs(self.role.name):
+        for topic in self.contract.outputs(self.role.name):
             end = sent.pop(topic.name, None)
             wanted = f"{topic.type} {topic.type_hash[:15]}"
             got = "no publisher's token" if end is None else f"{end.type} {end.type_hash[:15]}"
@@ -166,7 +166,7 @@ class LiveRig(Rig):
         """Send undecodable bytes and messages of an unknown sender on every input."""
         stranger = AttachmentWriter(gid("a stranger")).pack
         for name in self._publishers:
-            topic = self.rules.topics[name]
+            topic = self.contract.topics[name]
             key = topic_key(topic, self._domain)
             self._session.put(key, b"\xff" * 40)
             self._session.put(key, b"\xff" * 40, attachment=b"no attachment")
@@ -174,7 +174,7 @@ class LiveRig(Rig):
             self._next(name, b"\x00\x01\x00\x00\xff")
         after = self.run(0.6, {})
         self._received_reports()
-        silent = [t.name for t in self.rules.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
+        silent = [t.name for t in self.contract.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
         there = self.role.name in self._others()
         states = {"gone": not there, f"silent on {', '.join(silent)}": silent, f"failed: {self.error}": self.error}
         got = next((text for text, so in states.items() if so), "continues")
@@ -205,11 +205,11 @@ class LiveRig(Rig):
     # -- the rig
 
     def _advance(self, end: int, feed: Feed) -> None:
-        last = {name: (self.t - 1) // self.rules.topics[name].period for name in feed}
+        last = {name: (self.t - 1) // self.contract.topics[name].period for name in feed}
         while True:
             now = max(time_ns() - self._epoch, 0)
             for name, source in feed.items():
-                period = self.rules.topics[name].period
+                period = self.contract.topics[name].period
                 if now // period > last[name]:
                     last[name] = now // period
                     message = source(last[name] * period)
@@ -226,7 +226,7 @@ class LiveRig(Rig):
 
     def send(self, topic: str, message: Message) -> None:
         """Publish a message as its producer."""
-        self._next(topic, codec.encode(message, self.rules.topics[topic].type))
+        self._next(topic, codec.encode(message, self.contract.topics[topic].type))
 
     def lose(self, role: str) -> None:
         """Report a role as lost, as a conductor does."""
@@ -238,7 +238,7 @@ class LiveRig(Rig):
 
     def _drain(self) -> None:
         for name, reader in self._readers.items():
-            kind = self.rules.topics[name].type
+            kind = self.contract.topics[name].type
             while (received := reader.get(0)) is not None:
                 try:
                     message = codec.decode(received.payload, kind)

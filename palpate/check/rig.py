@@ -111,10 +111,10 @@ class Rig(ABC):
     """True for a separate process in real time."""
 
     def __init__(self, role: str, settings: RigSettings) -> None:
-        self.rules = contract()
-        self.role = self.rules.roles[role]
+        self.contract = contract()
+        self.role = self.contract.roles[role]
         self.settings = settings
-        self.log: dict[str, list[ReceivedMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}
+        self.log: dict[str, list[ReceivedMessage]] = {topic.name: [] for topic in self.contract.outputs(role)}
         """All messages of the implementation, by topic."""
         self.undecodable: list[str] = []
         """Descriptions of payloads that could not be decoded."""
@@ -210,12 +210,12 @@ class ServiceRig(Rig):
         """The first number of `steps` is that of its steps."""
         super().__init__(service.role, settings)
         self._steps: MutableSequence[int] = [0] if steps is None else steps
-        self._stepper = Stepper(service, self.rules, strict=False, refuse=self._log_refused)
+        self._stepper = Stepper(service, self.contract, strict=False, refuse=self._log_refused)
         self._sequences = dict.fromkeys(self._stepper.buffers, 0)
         self._take(self._stepper.start())
 
     def _advance(self, end: int, feed: Feed) -> None:
-        due = [(name, self.rules.topics[name].period, source) for name, source in feed.items()]
+        due = [(name, self.contract.topics[name].period, source) for name, source in feed.items()]
         while self.t < end:
             for name, period, source in due:
                 if not self.t % period and (message := source(self.t)) is not None:
@@ -228,8 +228,8 @@ class ServiceRig(Rig):
     def send(self, topic: str, message: Message) -> None:
         """Deliver a message as bytes, like the wire."""
         self._sequences[topic] += 1
-        buffer = self._stepper.buffers[topic]
-        buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic], checked=True))
+        payload = codec.encode(message, self.contract.topics[topic].type)
+        self._stepper.buffers[topic].deliver(Packet(payload, self.t, self._sequences[topic], checked=True))
 
     def lose(self, role: str) -> None:
         """Mark a role lost."""

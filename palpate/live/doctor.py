@@ -148,22 +148,22 @@ def _clock(live: LiveMonitor) -> Iterator[Remark]:
     yield Remark("clock", Severity.OK if time is not None and progress else Severity.WARN, text)
     for name, age in live.offsets.items():
         if age < LIMITS.min_message_age_ms:
-            sender = live.monitor.rules.topics[name].producer
+            sender = live.monitor.contract.topics[name].producer
             text = f"the clock of {sender}'s host is at least {-age:.1f} ms ahead of ours ({name}); synchronise them (NTP, PTP)"
             yield Remark("clock", Severity.WARN, text)
 
 
 def _who(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
     """Report missing and unknown roles, and which share a process."""
-    rules, alive = contract(), live.graph.alive.values()
-    absent = graph.missing(rules, alive, bus.target.run)
-    workers = [role for role in absent if not rules.roles[role].observer]
-    yield from (Remark("roles", Severity.BAD, f"{role} is missing: {rules.roles[role].doc}") for role in workers)
+    roles, alive = contract().roles, live.graph.alive.values()
+    absent = graph.missing(contract(), alive, bus.target.run)
+    workers = [role for role in absent if not roles[role].observer]
+    yield from (Remark("roles", Severity.BAD, f"{role} is missing: {roles[role].doc}") for role in workers)
     if not workers:
         yield Remark("roles", Severity.OK, "all required roles are there")
     if others := [role for role in absent if role not in workers]:
         yield Remark("roles", Severity.OK, f"without {', '.join(others)} (observers)")
-    if strangers := sorted(live.graph.roles() - rules.roles.keys()):
+    if strangers := sorted(live.graph.roles() - roles.keys()):
         yield Remark("roles", Severity.OK, f"also there: {', '.join(strangers)}")
     if live.graph.garbage:
         yield Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's")

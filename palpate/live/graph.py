@@ -41,12 +41,12 @@ def ends(found: Iterable[Entity], *kinds: EntityKind) -> list[tuple[str, Endpoin
     return [(entity.node, entity.endpoint) for entity in found if entity.kind in kinds and entity.endpoint is not None]
 
 
-def missing(rules: Contract, found: Iterable[Entity], run: Run | None) -> list[str]:
+def missing(contract: Contract, found: Iterable[Entity], run: Run | None) -> list[str]:
     """Return the roles that are not on the bus, critical ones first.
 
     Expected are all observers and the roles of `run`, or, if the run is unknown, the roles of every run.
     """
-    there, roles = {entity.node for entity in found}, rules.roles.values()
+    there, roles = {entity.node for entity in found}, contract.roles.values()
     expected = [role for role in roles if role.observer or (role.name in run.endpoints if run else not role.optional)]
     expected.sort(key=lambda role: (role.observer, not role.critical))
     return [role.name for role in expected if role.name not in there]
@@ -65,20 +65,19 @@ def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = 
     """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
     with join_bus(connect, run, domain) as bus:
         found = present(bus)
-        rules = contract()
-        absent = missing(rules, found, bus.target.run)
+        absent = missing(contract(), found, bus.target.run)
     listed: list[dict[str, Any]] = []
     for name, own in groupby(sorted(found, key=attrgetter("node")), key=attrgetter("node")):
         mine = list(own)
         kinds = {"publishes": EntityKind.PUBLISHER, "subscribes": EntityKind.SUBSCRIPTION}
         topics = {what: sorted(end.topic for _, end in ends(mine, kind)) for what, kind in kinds.items()}
-        listed.append({"node": name, "role": name in rules.roles, "sessions": sorted({one.zid for one in mine}), **topics})
+        listed.append({"node": name, "role": name in contract().roles, "sessions": sorted({one.zid for one in mine}), **topics})
     if as_json:
         print_json({"nodes": listed, "missing": absent})
         return
     out = table("node", "what", ">publishes", ">subscribes", "session")
     for node in listed:
-        role = rules.roles.get(node["node"])
+        role = contract().roles.get(node["node"])
         what = role.doc if role is not None else Text("not a role of the contract", "dim")
         out.add_row(node["node"], what, *(str(len(node[key])) for key in ("publishes", "subscribes")), " ".join(node["sessions"]))
     wide_console().print(out)

@@ -136,7 +136,7 @@ class TopicResult:
 def compare(
     expected: Iterable[RecordedMessage],
     sent: Iterable[RecordedMessage],
-    rules: Contract,
+    contract: Contract,
     tolerance: Tolerance,
     topics: Iterable[str],
 ) -> dict[str, TopicResult]:
@@ -161,7 +161,7 @@ def compare(
         if then.payload == now.payload:
             result.identical += 1
         else:
-            _differ(result, rules.topics[now.topic], then, now, tolerance)
+            _differ(result, contract.topics[now.topic], then, now, tolerance)
     for left in chain(waiting.values(), [] if following is None else [following], recorded):
         results[left.topic].missing += 1
     return results

@@ -35,7 +35,7 @@ from palpate_plugins import PluginError
 
 
 def rerun(
-    service: Service, rules: Contract, inputs: Iterable[RecordedMessage], end: int, begin: int = 0
+    service: Service, contract: Contract, inputs: Iterable[RecordedMessage], end: int, begin: int = 0
 ) -> Iterator[RecordedMessage]:
     """Yield the messages of `service` for `inputs` (ordered by stamp), from its start to the tick `end` [ns].
 
@@ -46,7 +46,7 @@ def rerun(
     of one is unknown; here it is the tick after its stamp, as in a composed run. Raises LockstepError if the service breaks its
     contract.
     """
-    stepper = Stepper(service, rules)
+    stepper = Stepper(service, contract)
 
     def deliver(message: RecordedMessage) -> None:
         stepper.buffers[message.topic].deliver(Packet(message.payload, message.stamp, message.sequence))
@@ -72,7 +72,7 @@ DROPPED_BITS = np.int64(~((1 << 29) - 1))
 """Mask that keeps 23 of the 52 fraction bits of a double, so 24 significant bits."""
 
 
-def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int, end: int) -> Iterator[RecordedMessage]:
+def cut(recording: Recording, contract: Contract, topics: Iterable[str], begin: int, end: int) -> Iterator[RecordedMessage]:
     """Yield the messages of `topics` from `begin` to `end` [ns], rounded, with times and sequence numbers from zero.
 
     The last earlier message of each topic that is not periodic comes first, as for a late joiner.
@@ -82,9 +82,9 @@ def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int
     before: dict[str, RecordedMessage] = {}
     if begin > 0:
         before = {message.topic: message for message in recording.messages(names, None, begin - 1)}
-    kept = [message._replace(stamp=begin) for message in before.values() if not rules.topics[message.topic].periodic]
+    kept = [message._replace(stamp=begin) for message in before.values() if not contract.topics[message.topic].periodic]
     for message in [*kept, *recording.messages(names, begin, end)]:
-        topic = rules.topics[message.topic]
+        topic = contract.topics[message.topic]
         numbers[topic.name] += 1
         stamp = message.stamp - begin
         sequence = stamp // topic.period + 1 if topic.periodic else numbers[topic.name]
@@ -116,7 +116,7 @@ def _round(values: Any) -> Any:
 
 
 def write_recording(
-    path: Path, rules: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
+    path: Path, contract: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
     """Write messages to an MCAP file and replace an old file when the new one is complete.
 
@@ -130,7 +130,7 @@ def write_recording(
         channels: dict[str, int] = {}
         for message in messages:
             if message.topic not in channels:
-                channels[message.topic] = _register(writer, rules.topics[message.topic])
+                channels[message.topic] = _register(writer, contract.topics[message.topic])
             writer.add_message(channels[message.topic], message.stamp, message.payload, message.stamp, message.sequence)
         for name, (kind, data) in attachments.items():
             writer.add_attachment(0, 0, name, kind, data)
@@ -152,25 +152,25 @@ class GoldenCase(NamedTuple):
     service: Service
     scenario: str
     """YAML."""
-    rules: Contract
+    contract: Contract
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Recorded topics that the service reads."""
-        return tuple(topic.name for topic, _ in self.rules.inputs(self.role) if topic.name in self.recording.types)
+        return tuple(topic.name for topic, _ in self.contract.inputs(self.role) if topic.name in self.recording.types)
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """Recorded topics that the service sends."""
-        return tuple(topic.name for topic in self.rules.outputs(self.role) if topic.name in self.recording.types)
+        return tuple(topic.name for topic in self.contract.outputs(self.role) if topic.name in self.recording.types)
 
     @property
     def end(self) -> int:
         """Last tick of the role in the recording [ns], from its periodic outputs, else from the recording's last stamp."""
-        period = self.rules.roles[self.role].period
-        periodic = [t for t in self.outputs if self.rules.topics[t].periodic and self.recording.counts[t]]
+        period = self.contract.roles[self.role].period
+        periodic = [t for t in self.outputs if self.contract.topics[t].periodic and self.recording.counts[t]]
         if periodic:
-            return max((self.recording.counts[t] - 1) * self.rules.topics[t].period for t in periodic)
+            return max((self.recording.counts[t] - 1) * self.contract.topics[t].period for t in periodic)
         return self.recording.last - self.recording.last % period
 
 
@@ -180,24 +180,23 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     The scenario is `scenario`, else the one in the recording, else the one in its folder. Raises RecordingError, PluginError or
     ScenarioError.
     """
-    rules = contract()
     role, _, name = choice.partition("=")
-    workers = [row.name for row in rules.roles.values() if not row.observer and row.name != "conductor"]
+    workers = [row.name for row in contract().roles.values() if not row.observer and row.name != "conductor"]
     if role not in workers:
         raise PluginError(f"--service {choice}: there is no service {role!r}; allowed are {', '.join(workers)}")
     if name:
         implementations.kind(role).check(name)
     recording = open_recording(path)
     text = read_text(scenario) if scenario else recording.scenario or _scenario_near(path, role)
-    topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
-    recording.check(rules, topics)
+    topics = [topic.name for topic, _ in contract().inputs(role)] + [topic.name for topic in contract().outputs(role)]
+    recording.check(contract(), topics)
     if recording.origin([name for name in topics if recording.counts.get(name)]):
         raise RecordingError(f"{path}: has Unix time, not that of a run: it can be played, but no service re-run on it")
-    if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
+    if not any(recording.counts.get(topic.name) for topic in contract().outputs(role)):
         raise RecordingError(f"{path}: has no message of {role} to compare with")
     loaded = load_text(text)
     service = implementations.create(role, name or getattr(loaded.services, role), loaded)
-    return GoldenCase(recording, role, service, text, rules)
+    return GoldenCase(recording, role, service, text, contract())
 
 
 def load_text(text: str) -> Scenario:
@@ -221,27 +220,27 @@ def replay_service(case: GoldenCase, tolerance: Tolerance, reached: MutableSeque
     """Run the service again and compare all its messages; the stamp of each [ns] is written into `reached`."""
 
     def sent() -> Iterator[RecordedMessage]:
-        for message in rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end):
+        for message in rerun(case.service, case.contract, case.recording.messages(case.inputs), case.end):
             if reached is not None:
                 reached[0] = message.stamp
             yield message
 
     expected = case.recording.messages(case.outputs, end=case.end)
-    results = compare(expected, sent(), case.rules, tolerance, case.outputs)
+    results = compare(expected, sent(), case.contract, tolerance, case.outputs)
     case.service.finish()
     return results
 
 
 def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
     """Write a reference: the inputs of the service from `begin` to `end` [ns] and its outputs."""
-    period = case.rules.roles[case.role].period
+    period = case.contract.roles[case.role].period
     begin -= begin % max(period, 100 * MS)  # a tick of every role
     end = min(end, case.end)
-    given = list(cut(case.recording, case.rules, case.inputs, begin, end))
-    sent = rerun(case.service, case.rules, iter(given), (end - begin) // period * period)
-    answers = (message._replace(payload=round_message(case.rules.topics[message.topic], message.payload)) for message in sent)
+    given = list(cut(case.recording, case.contract, case.inputs, begin, end))
+    sent = rerun(case.service, case.contract, iter(given), (end - begin) // period * period)
+    answers = (message._replace(payload=round_message(case.contract.topics[message.topic], message.payload)) for message in sent)
     attached = {SCENARIO: ("application/yaml", case.scenario.encode())}
-    write_recording(path, case.rules, chain(given, answers), attached)
+    write_recording(path, case.contract, chain(given, answers), attached)
 
 
 def write_reference(file: Path, service: str, scenario: Path | None, start: int, end: int | None, target: Path) -> None:

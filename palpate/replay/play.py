@@ -57,9 +57,8 @@ class Player:
         self._rate = rate
         self._drive = drive
         self._looked = 0
-        rules = contract()
-        self.topics = _chosen(recording, rules, topics)
-        recording.check(rules, self.topics, whole=False)
+        self.topics = _chosen(recording, contract(), topics)
+        recording.check(contract(), self.topics, whole=False)
         self.origin = recording.origin(self.topics)
         """Stamp [ns] from which the times of `play` count."""
         if (span := recording.last - self.origin) > PLAY.longest_ns:
@@ -79,15 +78,15 @@ class Player:
             self._members = members  # a deleted member withdraws its tokens
             self._publishers: dict[str, Sender] = {}
             for name in (*self.topics, *clock):
-                row = rules.topics[name]
+                row = contract().topics[name]
                 if row.producer not in members:
-                    members[row.producer] = Member(self._session, row.producer, rules, domain)
+                    members[row.producer] = Member(self._session, row.producer, contract(), domain)
                 self._publishers[name] = members[row.producer].publisher(row)
         except BaseException:
             close_session(self._session)
             raise
         self._own_clock = bool(clock)
-        self._encode_clock = codec.encoder(rules.topics[CLOCK].type)
+        self._encode_clock = codec.encoder(contract().topics[CLOCK].type)
         self._next_clock = 0
         self.now = 0
         """Time reached [ns], from the recording's origin."""
@@ -100,13 +99,12 @@ class Player:
         self._graph.changes()
         own = str(self._session.zid())
         alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
-        rules = contract()
         for name in self.topics if alive else ():
-            row = rules.topics[name]
+            row = contract().topics[name]
             if row.producer in alive:
                 advice = "play on another bus (--listen) or other topics"
                 raise UserError(f"{row.producer} runs on this bus and sends {name} itself; {advice}")
-            acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
+            acting = sorted(role for role in row.readers if role in alive and not contract().roles[role].observer)
             if acting and not self._drive:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
@@ -136,8 +134,7 @@ class Player:
 
     def _prelude(self, start: int) -> None:
         """Send the last message before `start` of each topic that is not periodic, which a late joiner would receive."""
-        rules = contract()
-        quiet = [name for name in self.topics if not rules.topics[name].periodic]
+        quiet = [name for name in self.topics if not contract().topics[name].periodic]
         last = {message.topic: message for message in self._recording.messages(quiet, end=start - 1)}
         for message in last.values():
             self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
@@ -167,15 +164,15 @@ class Player:
         close_session(self._session)
 
 
-def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
+def _chosen(recording: Recording, contract: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
     for name in topics or ():
         if name.strip("/") not in recording.types:
             raise UserError(f"--topic {name}: {recording.path} has {', '.join(sorted(recording.types))}")
     wanted = [name.strip("/") for name in topics] if topics else list(recording.types)
-    unknown = [name for name in wanted if name not in rules.topics]
+    unknown = [name for name in wanted if name not in contract.topics]
     if unknown and topics:
         raise UserError(f"--topic {', '.join(unknown)}: not in the contract")
-    chosen = tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
+    chosen = tuple(name for name in wanted if name in contract.topics and recording.counts.get(name))
     if not chosen:
         known = ", ".join(f"{name} ({recording.types[name].name})" for name in sorted(wanted)[:12]) or "no topic with a schema"
         raise UserError(f"{recording.path}: has no message on a topic of the contract; it has {known}")

@@ -203,9 +203,8 @@ def tick_after(t: int, role: str) -> int:
 
 def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
     """Return the recorded inputs of a role, in order. Raises RecordingError."""
-    rules = contract()
-    topics = [topic.name for topic, _ in rules.inputs(role) if topic.name in recording.types]
-    recording.check(rules, topics)
+    topics = [topic.name for topic, _ in contract().inputs(role) if topic.name in recording.types]
+    recording.check(contract(), topics)
     return recording.messages(topics)
 
 

@@ -81,17 +81,17 @@ def _assess(run: archive.InterruptedRun) -> None:
     exam = collected.exam
     if exam is None:
         return
-    rules, row = contract(), contract().topics["exam/state"]
+    row = contract().topics["exam/state"]
     end = archive.tick_after(recording.last, "assessment")
     aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
     over = RecordedMessage(end, row.name, aborted, len(collected.exam_states) + 1)
     service = create("assessment", scenario.services.assessment, restrict_to_view(scenario, view_of("assessment")))
     received = chain(archive.inputs(recording, "assessment"), [over])
-    for sent in rerun(service, rules, received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
+    for sent in rerun(service, contract(), received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
         if sent.topic == "assessment/map":
-            collected.stiffness_map = codec.decode(sent.payload, rules.topics[sent.topic].type)
+            collected.stiffness_map = codec.decode(sent.payload, contract().topics[sent.topic].type)
         elif sent.topic == "assessment/findings":
-            collected.findings = codec.decode(sent.payload, rules.topics[sent.topic].type)
+            collected.findings = codec.decode(sent.payload, contract().topics[sent.topic].type)
 
 
 class Resumption(NamedTuple):

@@ -18,8 +18,7 @@ HEAD = """\
 
 
 def main() -> None:
-    rules = contract()
-    rows = [*rules.topics.values(), *rules.internal.values()]
+    rows = [*contract().topics.values(), *contract().internal.values()]
     names = sorted({row.type for row in rows} | set(palpation_definitions()))
     hashes = {name: codec.type_hash(name) for name in names}
     Path(__file__).with_name("type_hashes.yaml").write_text(HEAD + yaml.safe_dump(hashes, width=200), encoding="utf-8")

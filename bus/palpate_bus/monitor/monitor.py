@@ -43,19 +43,19 @@ from palpate_bus.wire.transport import subscribe, try_decode
 class Monitor:
     """Checks a bus against the contract. `rate`: simulated per wall time in wall-clock mode; None in lockstep."""
 
-    def __init__(self, rules: Contract, rate: float | None = None) -> None:
-        self.rules = rules
+    def __init__(self, contract: Contract, rate: float | None = None) -> None:
+        self.contract = contract
         self.rate = rate
         self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation, by (topic, sender, kind, field)."""
         self.time = BusTime(0.0, 0, None)
         """Progress of the bus time as of the last check."""
-        self.listening: frozenset[str] = frozenset(rules.topics)
+        self.listening: frozenset[str] = frozenset(contract.topics)
         """Subscribed topics; silence of the others is not a violation."""
         self._kept: dict[str, TopicHealth] = {}
-        self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in rules.topics}
-        self._checkers = {name: Checker(topic) for name, topic in rules.topics.items()}
-        self._decoders = {name: codec.decoder(topic.type) for name, topic in rules.topics.items()}
+        self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in contract.topics}
+        self._checkers = {name: Checker(topic) for name, topic in contract.topics.items()}
+        self._decoders = {name: codec.decoder(topic.type) for name, topic in contract.topics.items()}
         self._nodes: dict[bytes, str] = {}
         self._left: set[bytes] = set()
         """Senders that have left the bus."""
@@ -68,7 +68,7 @@ class Monitor:
         chosen = frozenset(names)
         for name in self.listening - chosen:
             if self._streams[name]:
-                self._kept[name] = self._health(self.rules.topics[name])
+                self._kept[name] = self._health(self.contract.topics[name])
                 self._streams[name] = {}
         for name, node in self._since:
             if name in chosen - self.listening:
@@ -87,9 +87,9 @@ class Monitor:
                     del streams[gid]
         self._publishers = {}
         for entity in present:
-            if entity.endpoint is None or entity.endpoint.topic not in self.rules.topics:
+            if entity.endpoint is None or entity.endpoint.topic not in self.contract.topics:
                 continue
-            topic, described = self.rules.topics[entity.endpoint.topic], entity.endpoint
+            topic, described = self.contract.topics[entity.endpoint.topic], entity.endpoint
             publishes = entity.kind is EntityKind.PUBLISHER
             if publishes:
                 self._publishers.setdefault(topic.name, set()).add(entity.node)
@@ -102,7 +102,7 @@ class Monitor:
 
     def receive(self, name: str, sent: int, sequence: int, gid: bytes, payload: bytes, now: float) -> None:
         """Take a message of a topic: source time [ns, wall], sequence number, GID and CDR. `now` [s] is a steady clock."""
-        topic = self.rules.topics[name]
+        topic = self.contract.topics[name]
         stream = self._streams[name].get(gid)
         if stream is None:
             stream = self._streams[name][gid] = Stream(self._sender(gid), now, sequence=sequence - 1)
@@ -127,11 +127,11 @@ class Monitor:
 
     def garbage(self, name: str, why: str, now: float) -> None:
         """Note bytes on a topic that are not a message."""
-        self._note(self.rules.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
+        self._note(self.contract.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
 
     def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes, now: float) -> None:
         """Note a message on a topic's key with another type or hash."""
-        topic = self.rules.topics[name]
+        topic = self.contract.topics[name]
         self._note(topic, self._sender(gid), Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
 
     def check(self, now: float, wall: int) -> list[Violation]:
@@ -140,7 +140,7 @@ class Monitor:
             for stream in streams.values():
                 stream.mark(now)
                 stream.ages.append((wall - stream.sent) / MS)
-        rows = self.rules.topics
+        rows = self.contract.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
         present = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
         self.time = bus_time(present, self.rate)
@@ -155,7 +155,7 @@ class Monitor:
 
     def health(self) -> list[TopicHealth]:
         """Return the health of every topic, in the contract's order."""
-        return [self._health(topic) for topic in self.rules.topics.values()]
+        return [self._health(topic) for topic in self.contract.topics.values()]
 
     def _health(self, topic: Topic) -> TopicHealth:
         streams = [stream for stream in self._streams[topic.name].values() if stream.window]
@@ -219,7 +219,7 @@ class Monitor:
     def _check_silent(self, now: float) -> None:
         """Note topics whose producer is on the bus but has sent nothing."""
         for name, nodes in self._publishers.items():
-            topic = self.rules.topics[name]
+            topic = self.contract.topics[name]
             if name not in self.listening:
                 continue
             active = {stream.sender for stream in self._streams[name].values()}
@@ -243,9 +243,14 @@ class LiveMonitor:
     """A `Monitor` on a bus, for all topics or for `topics` only; see `listen`."""
 
     def __init__(
-        self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, rate: float | None = None
+        self,
+        session: zenoh.Session,
+        contract: Contract,
+        domain: int,
+        topics: Iterable[str] | None = None,
+        rate: float | None = None,
     ) -> None:
-        self.monitor = Monitor(rules, rate)
+        self.monitor = Monitor(contract, rate)
         self.graph = GraphWatch(session, domain)
         self.reports: dict[str, tuple[ServiceReport, float]] = {}
         """Last report by role, and the monotonic time of its receipt [s]."""
@@ -253,14 +258,11 @@ class LiveMonitor:
         """Minimum age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
         self._subscribers: dict[str, Any] = {}
-        self.listen(rules.topics if topics is None else topics)
+        self.listen(contract.topics if topics is None else topics)
         report, control = "palpation_msgs/msg/ServiceReport", "palpation_msgs/msg/RunControl"
-        self._reports: Any = session.declare_subscriber(
-            message_key("palpate/report/*", report, domain), zenoh.handlers.FifoChannel(ROOM)
-        )
-        self._control: Any = session.declare_subscriber(
-            message_key("palpate/control", control, domain), zenoh.handlers.FifoChannel(ROOM)
-        )
+        keys = message_key("palpate/report/*", report, domain), message_key("palpate/control", control, domain)
+        both: list[Any] = [session.declare_subscriber(key, zenoh.handlers.FifoChannel(ROOM)) for key in keys]
+        self._reports, self._control = both
         self._decode_report, self._decode_control = codec.decoder(report), codec.decoder(control)
 
     def listen(self, topics: Iterable[str]) -> None:
@@ -269,7 +271,7 @@ class LiveMonitor:
         for name in self._subscribers.keys() - chosen:
             self._subscribers.pop(name).undeclare()
         for name in chosen - self._subscribers.keys():
-            key, latched = any_type_key(name, self._domain), self.monitor.rules.topics[name].latched
+            key, latched = any_type_key(name, self._domain), self.monitor.contract.topics[name].latched
             self._subscribers[name] = subscribe(self._session, key, zenoh.handlers.FifoChannel(ROOM), history=latched)
         self.monitor.listen(chosen, monotonic())
 
@@ -298,7 +300,7 @@ class LiveMonitor:
         except (WireError, AttributeError) as error:
             self.monitor.garbage(name, "no attachment" if sample.attachment is None else str(error), now)
             return
-        topic = self.monitor.rules.topics[name]
+        topic = self.monitor.contract.topics[name]
         if (key.type, key.type_hash) != (topic.type, topic.type_hash):
             self.monitor.foreign(name, key.type, key.type_hash, gid, now)
             return

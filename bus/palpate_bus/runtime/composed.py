@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, MutableSequence, Sequence
 from contextlib import nullcontext, suppress
 from typing import Any
 
-from palpate_bus.contract import Contract, Topic, contract
+from palpate_bus.contract import Contract, Topic, contract as default_contract
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import Outgoing, Stepper, run_hash
@@ -41,16 +41,16 @@ class Composed:
     def __init__(
         self,
         services: Sequence[Service],
-        rules: Contract | None = None,
+        contract: Contract | None = None,
         taps: Sequence[Tap] = (),
         at: MutableSequence[int] | None = None,
     ) -> None:
         """`at` is kept up to date: the number of the role that steps, in the order of the contract, and simulated time [ns]."""
-        rules = rules or contract()
-        self._group = Group(services, rules)
+        contract = contract or default_contract()
+        self._group = Group(services, contract)
         self.steppers = self._group.steppers
         self._at: MutableSequence[int] = [NO_ROLE, 0] if at is None else at
-        numbers = {role: number for number, role in enumerate(rules.roles)}
+        numbers = {role: number for number, role in enumerate(contract.roles)}
         self._numbers = {stepper: numbers[role] for role, stepper in self.steppers.items()}
         self._taps = tuple(taps)
         self._started = False

@@ -59,9 +59,9 @@ CONDUCTOR_LOST_LOG: Final = "conductor_lost: %s"
 TRANSPORT_LOST: Final = "the router of the bus does not answer"
 
 
-def longest_silence_s(rules: Contract, wallclock: bool) -> float:
+def longest_silence_s(contract: Contract, wallclock: bool) -> float:
     """Return the silence [s] after which a conductor that has sent a heartbeat counts as lost."""
-    return rules.internal[HEARTBEAT].deadline / NS if wallclock else TIMES.lockstep_heartbeat_s
+    return contract.internal[HEARTBEAT].deadline / NS if wallclock else TIMES.lockstep_heartbeat_s
 
 
 class RunAborted(RunError):
@@ -78,7 +78,7 @@ class ConductorLink:
         self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
         self._decode = codec.decoder(CONTROL_TYPE)
         wallclock = Settings.read().runtime == "wallclock"
-        self._deadline_s = longest_silence_s(member.rules, wallclock)
+        self._deadline_s = longest_silence_s(member.contract, wallclock)
         self._busy_s = TIMES.busy_s if wallclock else TIMES.lockstep_busy_s
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = TIMES.first_message_s

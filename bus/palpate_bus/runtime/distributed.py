@@ -32,15 +32,15 @@ class LockstepNode(Node):
 
     def __init__(self, services: Sequence[Service], members: Mapping[str, Member]) -> None:
         """`members` gives the bus member of each role."""
-        rules = next(iter(members.values())).rules
-        self._group = Group(services, rules)
+        contract = next(iter(members.values())).contract
+        self._group = Group(services, contract)
         roles = self._group.steppers.keys()
         seats = [Seat(stepper, members[role]) for role, stepper in self._group.steppers.items()]
         super().__init__(seats, members[seats[0].role])
         self._seat = {seat.stepper: seat for seat in seats}
         self._inputs = {seat: RemoteInputs(seat.stepper, members[seat.role], roles) for seat in seats}
         self._advance_senders = {
-            seat: Advances(seat.stepper, members[seat.role]) for seat in seats if awaited_elsewhere(rules, seat.role, roles)
+            seat: Advances(seat.stepper, members[seat.role]) for seat in seats if awaited_elsewhere(contract, seat.role, roles)
         }
         self._horizon = NEVER
         self._last = False
@@ -137,7 +137,6 @@ class RemoteInputs:
         """`local` are the roles in this process, whose messages are delivered without the bus."""
         self._stepper = stepper
         self._now = member.transport.now
-        self._rules = member.rules
         self._data: dict[str, Subscription] = {}
         for name, buffer in stepper.buffers.items():
             if buffer.topic.producer in local and not buffer.topic.open:
@@ -152,7 +151,7 @@ class RemoteInputs:
         self.subscriptions = (*self._data.values(), *self._advance_inputs.values())
         self._last: dict[str, tuple[int, int]] = {}
         """Sequence number and sending time of the newest message by topic."""
-        self._event_topics = {role: event_topics(self._rules, role) for role in producers}
+        self._event_topics = {role: event_topics(member.contract, role) for role in producers}
         self._closed = dict.fromkeys(producers, 0)
         """Sequence number of the newest Advance by role."""
 
@@ -236,7 +235,7 @@ class Advances:
     """Sends the Advance messages of one service."""
 
     def __init__(self, stepper: Stepper, member: Member) -> None:
-        self._ports = [stepper.ports[name] for name in event_topics(member.rules, member.role)]
+        self._ports = [stepper.ports[name] for name in event_topics(member.contract, member.role)]
         self._publisher: Sender = member.internal_publisher(f"palpate/advance/{member.role}", ADVANCE_TYPE, "control")
         self._sequence = 0
 
@@ -251,12 +250,12 @@ class Advances:
         self._publisher.put(_encode(message), self._sequence)
 
 
-def event_topics(rules: Contract, role: str) -> tuple[str, ...]:
+def event_topics(contract: Contract, role: str) -> tuple[str, ...]:
     """Return the event topics of a role in contract order, the order of Advance.sequences."""
-    return tuple(topic.name for topic in rules.outputs(role) if topic.event)
+    return tuple(topic.name for topic in contract.outputs(role) if topic.event)
 
 
-def awaited_elsewhere(rules: Contract, role: str, local: Collection[str]) -> bool:
+def awaited_elsewhere(contract: Contract, role: str, local: Collection[str]) -> bool:
     """Return True if a role in another process waits for an event topic of the role."""
-    readers = [reader for name in event_topics(rules, role) for reader in rules.topics[name].readers.items()]
+    readers = [reader for name in event_topics(contract, role) for reader in contract.topics[name].readers.items()]
     return any(edge.blocking and reader not in local for reader, edge in readers)

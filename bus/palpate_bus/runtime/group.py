@@ -19,11 +19,11 @@ from palpate_bus.service import Service
 class Group:
     """Services of one process; `steppers` has them by role, in step order."""
 
-    def __init__(self, services: Sequence[Service], rules: Contract) -> None:
+    def __init__(self, services: Sequence[Service], contract: Contract) -> None:
         by_role = {service.role: service for service in services}
-        order = [role for role in rules.step_order(tuple(rules.roles)) if role in by_role]
-        order.sort(key=lambda role: rules.roles[role].observer)
-        self.steppers = {role: Stepper(by_role[role], rules) for role in order}
+        order = [role for role in contract.step_order(tuple(contract.roles)) if role in by_role]
+        order.sort(key=lambda role: contract.roles[role].observer)
+        self.steppers = {role: Stepper(by_role[role], contract) for role in order}
         self.period = gcd(*(stepper.role.period for stepper in self.steppers.values()))
         """Period of the group's ticks [ns]."""
         self._readers: dict[OutputPort, tuple[Callable[[Packet], None], ...]] = {

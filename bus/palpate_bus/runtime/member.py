@@ -24,13 +24,13 @@ class Member:
     """One role on the bus."""
 
     def __init__(
-        self, session: zenoh.Session, role: str, rules: Contract, domain: int, transport: Transport | None = None
+        self, session: zenoh.Session, role: str, contract: Contract, domain: int, transport: Transport | None = None
     ) -> None:
         """`transport` carries its messages; by default zenoh does, as the contract says."""
         self.session = session
         self.transport = transport or Transport(session)
         self.role = role
-        self.rules = rules
+        self.contract = contract
         self.domain = domain
         self.graph = GraphWatch(session, domain)
         self._tokens = NodeTokens(session, role, domain, self.transport.ids)
@@ -45,24 +45,24 @@ class Member:
 
     def publisher(self, topic: Topic) -> Sender:
         """Return a publisher of a topic of the contract."""
-        qos = self.rules.qos[topic.qos]
+        qos = self.contract.qos[topic.qos]
         return self.transport.publisher(topic.name, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos))
 
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
         """Return a subscription to a topic of the contract; with `history`, including earlier messages of a latched topic."""
-        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        self._tokens.subscription(topic, self.contract.qos[topic.qos])
         decode = codec.decoder(topic.type) if topic.open else None
         return self._keep(topic.name, self.transport.subscription(topic_key(topic, self.domain), history, decode))
 
     def observed(self, topic: Topic) -> str:
         """Declare a subscription that the caller makes; return its key."""
-        self._tokens.subscription(topic, self.rules.qos[topic.qos])
+        self._tokens.subscription(topic, self.contract.qos[topic.qos])
         return topic_key(topic, self.domain)
 
     def internal_publisher(self, name: str, type_name: str, qos: str) -> Sender:
         """Return a publisher of the runtime's own messages."""
         key = message_key(name, type_name, self.domain)
-        return self.transport.publisher(name, key, self.rules.qos[qos], self._tokens.node.gid)
+        return self.transport.publisher(name, key, self.contract.qos[qos], self._tokens.node.gid)
 
     def internal_subscription(self, name: str, type_name: str) -> Subscription:
         """Return a subscription to the runtime's own messages."""

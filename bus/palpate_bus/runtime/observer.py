@@ -97,7 +97,7 @@ class ObservedService:
 
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not only the newest of the periodic ones."""
-        self.stepper = Stepper(service, member.rules, refuse=member.note_refused)
+        self.stepper = Stepper(service, member.contract, refuse=member.note_refused)
         self.feeds = [
             _Feed(member, buffer.topic, lossless or not buffer.topic.periodic) for buffer in self.stepper.buffers.values()
         ]
@@ -150,7 +150,7 @@ class ObserverNode:
         self._member = member
         self._link = ConductorLink(member, LIMITS.stay_s)
         self._reports = Reports(member)
-        self._observed = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
+        self._observed = frozenset(role.name for role in member.contract.roles.values() if not role.observer)
         self._open()
 
     def _open(self) -> None:
@@ -257,15 +257,15 @@ class RecorderNode(ObserverNode):
         if not isinstance(service, RawRecorder):
             raise TypeError(f"the {service.role} service has no record(topic, payload, stamp, sequence)")
         self._recorder: RawRecorder = service
-        self._topics = member.rules.topics
-        producers = [role.name for role in member.rules.roles.values() if not role.observer]
+        self._topics = member.contract.topics
+        producers = [role.name for role in member.contract.roles.values() if not role.observer]
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
         self._numbers = dict.fromkeys(producers, 0)
         """Sequence number of the newest chunk by role."""
         # messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others
-        inputs = member.rules.inputs(self._service.role)
-        direct = [topic for topic, _ in inputs if member.rules.roles[topic.producer].observer]
+        inputs = member.contract.inputs(self._service.role)
+        direct = [topic for topic, _ in inputs if member.contract.roles[topic.producer].observer]
         direct.sort(key=lambda topic: topic.name != CLOCK)
         self._direct = [(topic, member.subscription(topic)) for topic in direct]
         self._clock = self._messages = self._garbage = 0

@@ -90,7 +90,7 @@ class ServiceOutput:
 
     def __init__(self, member: Member) -> None:
         role = member.role
-        self._publishers = {topic.name: member.publisher(topic) for topic in member.rules.outputs(role)}
+        self._publishers = {topic.name: member.publisher(topic) for topic in member.contract.outputs(role)}
         self._chunks = member.internal_publisher(f"palpate/record/{role}", CHUNK_TYPE, "event")
         self._chunk_sequence = 0
         self._writer = ChunkWriter(role, tuple(self._publishers)) if Settings.read().record != "none" else None

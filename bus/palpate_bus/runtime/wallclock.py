@@ -83,7 +83,7 @@ class WallClockNode(Node):
 
     def __init__(self, service: Service, member: Member) -> None:
         self._member = member
-        self._stepper = Stepper(service, member.rules, strict=False, refuse=self._refuse)
+        self._stepper = Stepper(service, member.contract, strict=False, refuse=self._refuse)
         self._seat = Seat(self._stepper, member)
         stays = TIMES.physics_stays_s if self._stepper.role.critical else 0.0
         super().__init__((self._seat,), member, TIMES.without_conductor_s + stays)

@@ -64,7 +64,7 @@ class _Rules:
             self.policies.setdefault(who, []).append(name)
 
 
-def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, Any]:
+def access_control(contract: Contract, by: str = "cert_common_names") -> dict[str, Any]:
     """Return the value of `access_control` in a router's configuration.
 
     `by`: the attribute that identifies a member in zenoh, `cert_common_names` or `usernames`.
@@ -72,23 +72,23 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     access = _Rules()
     presence = (_TOKEN, _WATCH)
     data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher has a token below its key
-    internal = list(rules.internal.values())
-    for role in rules.roles:
-        sends = [key for topic in rules.outputs(role) for key in _keys(topic.name)]
+    internal = list(contract.internal.values())
+    for role in contract.roles:
+        sends = [key for topic in contract.outputs(role) for key in _keys(topic.name)]
         sends += [key for row in internal if row.producer in ("any", role) for key in _keys(row.name.replace("<role>", role))]
-        gets = [key for topic, _ in rules.inputs(role) for key in _keys(topic.name)]
+        gets = [key for topic, _ in contract.inputs(role) for key in _keys(topic.name)]
         gets += [key for row in internal if row.readers in ("any", role) for key in _keys(row.name.replace("<role>", "*"))]
         access.allow(role, "sends", sends, True, data)
         access.allow(role, "gets", gets, False, data)
         tokens = [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]  # of its node, publishers and subscriptions, see `liveliness`
         access.allow(role, "lives", tokens, True, presence)
-    shown = public(rules)
+    shown = public(contract)
     access.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
         access.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
     access.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
     access.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
-    for member in (*rules.roles, VIEWER, OPERATOR):
+    for member in (*contract.roles, VIEWER, OPERATOR):
         access.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
     subjects = [{"id": member, by: [member]} for member in access.policies]
     policies = [{"rules": names, "subjects": [member]} for member, names in access.policies.items()]
@@ -96,15 +96,15 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     return {"enabled": True, "default_permission": "deny", **members}
 
 
-def list_watched(rules: Contract) -> list[str]:
+def list_watched(contract: Contract) -> list[str]:
     """Return the topics that the monitor of a run may receive, in the contract's order."""
-    shown = {*public(rules), *(topic.name for topic, _ in rules.inputs(WATCHER))}
-    return [name for name in rules.topics if name in shown]
+    shown = {*public(contract), *(topic.name for topic, _ in contract.inputs(WATCHER))}
+    return [name for name in contract.topics if name in shown]
 
 
-def public(rules: Contract) -> list[str]:
+def public(contract: Contract) -> list[str]:
     """Return the public topics, in the contract's order."""
-    return [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
+    return [topic.name for topic in contract.topics.values() if topic.visibility is Visibility.PUBLIC]
 
 
 def _keys(topic: str) -> list[str]:

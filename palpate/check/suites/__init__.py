@@ -46,7 +46,7 @@ LIVE: Final = LiveTolerances()
 def _contract(rig: Rig) -> None:
     """Check topics, rates, stamps and values."""
     rig.section("contract")
-    for topic in rig.rules.outputs(rig.role.name):
+    for topic in rig.contract.outputs(rig.role.name):
         received = rig.log[topic.name]
         if not received:
             if topic.event:

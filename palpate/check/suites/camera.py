@@ -51,7 +51,7 @@ def suite(rig: Rig) -> None:
     images, infos = burst[IMAGE], burst[INFO]
     rig.equal("takes as many frames as asked", len(images), PLANE.frames)
     rig.equal("intrinsics with every image, of the same stamp", _stamps(infos), stamps := _stamps(images))
-    period = rig.rules.topics[IMAGE].period
+    period = rig.contract.topics[IMAGE].period
     rig.below("at its rate", max(abs(np.diff(stamps) - period), default=0), rig.slack + 1, "ms off", 1 / MS)
     rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), PLANE.frames)
     if not images or not infos:

@@ -64,7 +64,7 @@ def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK) -> Fe
     if _positions(rig):
         values = values + rig.last("joint_states").position
     torque, position = (none, values) if _positions(rig) else (values, none)
-    valid = duration_message(rig.rules.topics[COMMAND].expiry)
+    valid = duration_message(rig.contract.topics[COMMAND].expiry)
     return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), torque, position, valid, "", "")}
 
 
@@ -190,8 +190,8 @@ def _expiry(rig: Rig) -> None:
     ended = rig.t
     received = rig.run(0.5 + rig.slack_s, quiet(rig))["robot/status"]
     hold = _hold(received)
-    expiry = rig.rules.topics[COMMAND].expiry_ms or 0
-    limit = (expiry + rig.rules.topics["robot/status"].period_ms + 3) * MS + rig.slack
+    expiry = rig.contract.topics[COMMAND].expiry_ms or 0
+    limit = (expiry + rig.contract.topics["robot/status"].period_ms + 3) * MS + rig.slack
     rig.below("holds safely when commands cease", np.inf if hold is None else hold.t - ended, limit, "ms", 1 / MS)
     _expect_hold(rig, "and states the reason", received, *CEASED)
     rig.below("and comes to rest", np.abs(rig.last("joint_states").velocity).max(), 0.1, "rad/s")

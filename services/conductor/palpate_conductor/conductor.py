@@ -54,7 +54,7 @@ class Conductor:
     def __init__(
         self,
         session: zenoh.Session,
-        rules: Contract,
+        contract: Contract,
         domain: int,
         roles: tuple[str, ...],
         collector: Collector,
@@ -62,11 +62,11 @@ class Conductor:
         timing: Timing | None = None,
     ) -> None:
         timing = timing or Timing()
-        member = Member(session, collector.role, rules, domain)
+        member = Member(session, collector.role, contract, domain)
         self._member = member
-        self._rules = rules
-        self._workers = tuple(role for role in roles if not rules.roles[role].observer)
-        self._observers = tuple(role for role in roles if rules.roles[role].observer)
+        self._contract = contract
+        self._workers = tuple(role for role in roles if not contract.roles[role].observer)
+        self._observers = tuple(role for role in roles if contract.roles[role].observer)
         self._roles = roles
         self._collector = collector
         self._observed = ObservedService(collector, member, lossless=True)
@@ -79,11 +79,11 @@ class Conductor:
         self._process_roles = {role: (role,) for role in roles}
         """All roles of a role's process, by role."""
         self._sequence = 0
-        self._heartbeat = Heartbeat(member, rules, timing.wallclock)
+        self._heartbeat = Heartbeat(member, contract, timing.wallclock)
         self._freezes = FreezeWatch(self._patience)
-        self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
+        self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in contract.topics.items()})
         self.result = RunResult("wallclock" if timing.wallclock else "distributed", collector.collected)
-        self._contract = ContractWatch(session, rules, domain, timing.wallclock_rate)
+        self._watch = ContractWatch(session, contract, domain, timing.wallclock_rate)
         collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._send(RunControl.GRANT, tick, last), timing)
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace, member.transport.key)
@@ -139,8 +139,8 @@ class Conductor:
 
     def diagnose(self) -> list[Any]:
         """Return the statuses of services, then topics, for `diagnostics`."""
-        services = service_statuses(self.watchdog.progress, self.result.lost, self._patience.soft, self._contract.violations)
-        return [*services, *self._contract.statuses()]
+        services = service_statuses(self.watchdog.progress, self.result.lost, self._patience.soft, self._watch.violations)
+        return [*services, *self._watch.statuses()]
 
     # -- the run
 
@@ -184,7 +184,7 @@ class Conductor:
                 self._notify(*([] if known else [failure.text]))
                 tell(self)
         self._operator_requests.close()
-        self._contract.close()
+        self._watch.close()
         self.result.sim_time_s = self.watchdog.reached / NS
         self._observed.drain_and_step(last=True)
         if not (self.result.failure or self._wallclock):
@@ -199,7 +199,7 @@ class Conductor:
         warned = False
         while len(missing_inputs) < len(self._roles) or any(missing_inputs.values()):
             self._heartbeat.loop_turned()
-            self._contract.poll()  # it receives the hellos, too, and must not fill up
+            self._watch.poll()  # it receives the hellos, too, and must not fill up
             self._send(RunControl.HELLO)
             sleep(TUNING.handshake_poll_s)
             for role, message, detail in self._receive_reports():
@@ -232,11 +232,11 @@ class Conductor:
             if perf_counter() - since > limit_s:
                 self.abort("start timed out")
                 raise RunFailed(FailureCode.NO_ANSWER, f"not ready after {limit_s:.0f} s: {'; '.join(waits)}", *silent)
-        self._contract.poll(force=True)  # so that the first diagnostics include the service that joined last
+        self._watch.poll(force=True)  # so that the first diagnostics include the service that joined last
 
     def _not_in_run(self, name: str) -> bool:
         """Return True if `name` is a topic whose producer has no part in this run."""
-        topic = self._rules.topics.get(name)
+        topic = self._contract.topics.get(name)
         return topic is not None and topic.producer not in (*self._roles, self._collector.role)
 
     def _conduct(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
@@ -256,7 +256,7 @@ class Conductor:
                 self._mark_lost(role, Failure(FailureCode.ROLE_LOST, why))
             self._notify(*self._member.complaints(), *self._member.suspicions())
             self._operator_requests.poll(self._collector.collected.supervisor)
-            self._contract.poll()
+            self._watch.poll()
             self._extend_grant()
             self._check_progress(finished)
             tell(self)
@@ -319,7 +319,7 @@ class Conductor:
             if role in finished or role in self.result.lost:
                 continue
             self._keep_slot_or_lose(role, Failure(FailureCode.FROZEN, how))
-            if not self._wallclock and not self._rules.roles[role].observer:
+            if not self._wallclock and not self._contract.roles[role].observer:
                 failure = self.result.failure or Failure(FailureCode.FROZEN, how)
                 raise RunFailed(failure.code, failure.text, *failure.roles)
 
@@ -356,11 +356,11 @@ class Conductor:
             texts.append(f"{one} lost at {tick / NS:.3f} s: {cause}")
         self.result.trouble += texts
         failure = Failure(cause.code, "; ".join(texts), tuple(dict.fromkeys((*lost, *cause.roles))), cause.topics)
-        if self._rules.roles[role].observer:
+        if self._contract.roles[role].observer:
             log.warning("%s; the run continues", failure)
             return
         self.result.failure = self.result.failure or failure
-        if any(self._rules.roles[one].critical for one in lost):
+        if any(self._contract.roles[one].critical for one in lost):
             raise RunFailed(failure.code, failure.text, *failure.roles, topics=failure.topics)
         for one in lost:
             self._send(RunControl.LOST, self.result.lost[one], role=one, reason=cause.text)

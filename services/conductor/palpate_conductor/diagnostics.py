@@ -38,13 +38,13 @@ TUNING = ContractWatchTuning()
 class ContractWatch:
     """Watches the bus of a run, whose wall-clock `rate` is None in lockstep. Call `poll` often."""
 
-    def __init__(self, session: zenoh.Session, rules: Contract, domain: int, rate: float | None = None) -> None:
-        topics = [rules.topics[name] for name in list_watched(rules)]
+    def __init__(self, session: zenoh.Session, contract: Contract, domain: int, rate: float | None = None) -> None:
+        topics = [contract.topics[name] for name in list_watched(contract)]
         received = [topic for topic in topics if topic.producer != WATCHER or topic.open]  # without its own
         fast = [topic.name for topic in received if topic.periodic and topic.period_ms < TUNING.fast_ms]
         self._slow = [topic.name for topic in received if topic.name not in fast]
         self._turns = cycle(fast)
-        self._live = LiveMonitor(session, rules, domain, self._slow, rate)
+        self._live = LiveMonitor(session, contract, domain, self._slow, rate)
         self._polled = self._round = monotonic()
         self._sampling = False
 

@@ -49,9 +49,9 @@ class Heartbeat:
     hangs, since a conductor that hangs does not pass on an operator's stop.
     """
 
-    def __init__(self, member: Member, rules: Contract, wallclock: bool) -> None:
-        self._period_s = rules.internal[HEARTBEAT].period / NS
-        self._deadline_s = longest_silence_s(rules, wallclock)
+    def __init__(self, member: Member, contract: Contract, wallclock: bool) -> None:
+        self._period_s = contract.internal[HEARTBEAT].period / NS
+        self._deadline_s = longest_silence_s(contract, wallclock)
         self._publisher = member.internal_publisher(HEARTBEAT, CONTROL_TYPE, QOS)
         self._message = codec.encoder(CONTROL_TYPE)(RunControl(RunControl.HEARTBEAT, os.getpid(), False, "", pid_space()))
         self._turned_at = self._sent_at = monotonic()

@@ -190,7 +190,7 @@ def run(lag: Path, rules: Contract, chosen: FmuMap) -> tuple[Source, str, list[A
     """Run a point that jumps at 0.1 s and the FMU."""
     source, sent = Source("follower", lambda t: (0.2 if t >= NS // 10 else 0.0, 0.1, 0.0)), []
     composed = Composed(
-        [source, host("lag", lag, chosen, FRAMES, rules=rules)],
+        [source, host("lag", lag, chosen, FRAMES, contract=rules)],
         rules,
         [lambda topic, payload, stamp, _: sent.append((topic.name, stamp, payload))],
     )
@@ -221,7 +221,7 @@ def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contrac
     still.messages["place"] = PoseStamped(header(0, "world"), pose((0.2, 0.1, 0.0)))
     places = []
     for ticks in ((0, 1, 2, 3, 4), (0, 4)):
-        service = host("lag", lag, table(tmp_path), FRAMES, rules=rules)
+        service = host("lag", lag, table(tmp_path), FRAMES, contract=rules)
         for k in ticks:
             sent = service.step(k * NS // 100, still)
         point = sent["follower"].point  # type: ignore[union-attr]
@@ -253,7 +253,7 @@ def test_a_map_that_does_not_fit_is_refused_with_what_is_allowed(
 ) -> None:
     assert old in MAP
     with pytest.raises((MapError, FmuError)) as caught:
-        host("lag", lag, table(tmp_path, MAP.replace(old, new)), FRAMES, rules=rules)
+        host("lag", lag, table(tmp_path, MAP.replace(old, new)), FRAMES, contract=rules)
     for word in words:
         assert word in str(caught.value)
 
@@ -261,12 +261,12 @@ def test_a_map_that_does_not_fit_is_refused_with_what_is_allowed(
 def test_a_unit_of_another_dimension_is_refused(lag: Path, tmp_path: Path) -> None:
     turned = parse(RULES.replace("units: {pose.position: m}", "units: {pose.position: rad}"))
     with pytest.raises(MapError, match="the topic is in rad, the FMU in mm"):
-        host("lag", lag, table(tmp_path), FRAMES, rules=turned)
+        host("lag", lag, table(tmp_path), FRAMES, contract=turned)
 
 
 def test_an_fmu_that_fails_names_itself_and_the_step(lag: Path, rules: Contract, tmp_path: Path) -> None:
     odd = parse(RULES.replace("lag: {period_ms: 10", "lag: {period_ms: 20"))
-    service = host("lag", lag, table(tmp_path), FRAMES, rules=odd)
+    service = host("lag", lag, table(tmp_path), FRAMES, contract=odd)
     with pytest.raises(FmuError, match=r"lag\.fmu: step from 0 s by 0\.02 s: fmi3Error"):
         service.step(0, HandInbox())
 
@@ -275,4 +275,4 @@ def test_a_file_that_is_no_fmu_is_refused(rules: Contract, tmp_path: Path) -> No
     path = tmp_path / "x.fmu"
     path.write_bytes(b"not a zip")
     with pytest.raises(FmuError, match="not an FMU"):
-        host("lag", path, table(tmp_path), FRAMES, rules=rules)
+        host("lag", path, table(tmp_path), FRAMES, contract=rules)

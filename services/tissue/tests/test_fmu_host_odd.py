@@ -74,7 +74,7 @@ def test_every_answer_of_a_step_ends_the_run_there(
 ) -> None:
     flags = odd in (Odd.TERMINATE, Odd.EARLY, Odd.EVENT)
     path = build_wall(tmp_path / "w.fmu", version)
-    service = host("wall", path, table(odd, 0.05), {}, rules=rules)
+    service = host("wall", path, table(odd, 0.05), {}, contract=rules)
     if flags and version == 2:
         assert len(run(service, rules)) == 10  # FMI 2.0 has no such flag
         return
@@ -88,14 +88,14 @@ def test_every_answer_of_a_step_ends_the_run_there(
 def test_warnings_are_counted_and_logged_once(rules: Contract, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for version in (2, 3):
         caplog.clear()
-        service = host("wall", build_wall(tmp_path / "w.fmu", version), table(Odd.WARNING), {}, rules=rules)
+        service = host("wall", build_wall(tmp_path / "w.fmu", version), table(Odd.WARNING), {}, contract=rules)
         run(service, rules)
         assert service.finish()["warnings"] == 11
         assert len([record for record in caplog.records if "further warnings" in record.message]) == 1
 
 
 def test_an_early_return_at_the_end_of_the_step_is_none(rules: Contract, tmp_path: Path) -> None:
-    service = host("wall", build_wall(tmp_path / "w.fmu", 3), table(Odd.EARLY_AT_END), {}, rules=rules)
+    service = host("wall", build_wall(tmp_path / "w.fmu", 3), table(Odd.EARLY_AT_END), {}, contract=rules)
     assert len(run(service, rules)) == 10
 
 
@@ -108,7 +108,7 @@ def test_an_fmu_begins_where_it_or_the_map_says(
     version: int, declared: str, chosen: float | None, wanted: float, rules: Contract, tmp_path: Path
 ) -> None:
     path = build_wall(tmp_path / "w.fmu", version, description(version, start=declared))
-    service = host("wall", path, table(Odd.ONLY_FROM_START, wanted, start_s=chosen), {}, rules=rules)
+    service = host("wall", path, table(Odd.ONLY_FROM_START, wanted, start_s=chosen), {}, contract=rules)
     forces = run(service, rules)
     np.testing.assert_allclose(forces, [800 * 0.01 * k for k in range(10)], atol=1e-9)
     assert service.finish()["start_s"] == wanted
@@ -149,7 +149,7 @@ def test_what_a_validator_finds_is_a_warning(
     version: int, name: str, rules: Contract, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = build_wall(tmp_path / "w.fmu", version, description(version, FINDINGS[name][version]))
-    assert len(run(host("wall", path, table(), {}, rules=rules), rules)) == 10
+    assert len(run(host("wall", path, table(), {}, contract=rules), rules)) == 10
     assert "finding of a validator" in caplog.text
 
 
@@ -157,7 +157,7 @@ def test_a_structure_that_names_no_variable_is_a_warning(rules: Contract, tmp_pa
     wrong = ((2, 'Unknown index="2"', 'Unknown index="99"'), (3, 'Output valueReference="1"', 'Output valueReference="98"'))
     for version, old, new in wrong:
         path = build_wall(tmp_path / "w.fmu", version, description(version).replace(old, new))
-        assert len(run(host("wall", path, table(), {}, rules=rules), rules)) == 10
+        assert len(run(host("wall", path, table(), {}, contract=rules), rules)) == 10
 
 
 @VERSIONS
@@ -205,7 +205,7 @@ def test_a_structural_parameter_sizes_the_arrays_of_fmi_3(tmp_path: Path) -> Non
 def test_a_map_may_name_a_topic_without_variables_an_element_or_a_boolean(version: int, rules: Contract, tmp_path: Path) -> None:
     path = build_wall(tmp_path / "w.fmu", version, description(version, BOOLEAN[version], base=0))
     for force, wanted in (("a[3]", 4.0), ("touching", 1.0)):
-        service = host("wall", path, table(force=force, inputs={"place": {}}), {}, rules=rules)
+        service = host("wall", path, table(force=force, inputs={"place": {}}), {}, contract=rules)
         assert run(service, rules)[-1] == wanted
 
 
@@ -249,4 +249,4 @@ def test_a_variable_of_text_is_refused_by_name(rules: Contract, tmp_path: Path) 
     text = '<ScalarVariable name="s" valueReference="8" causality="output" variability="discrete"><String/></ScalarVariable>'
     path = build_wall(tmp_path / "w.fmu", 2, description(2, text))
     with pytest.raises((MapError, FmuError), match="s: of type String; want"):
-        host("wall", path, table(force="s"), {}, rules=rules)
+        host("wall", path, table(force="s"), {}, contract=rules)

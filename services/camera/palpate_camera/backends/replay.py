@@ -39,9 +39,8 @@ class ReplayedCamera(Service):
 
         Raises RecordingError without a usable frame whose camera pose is known.
         """
-        rules = contract()
         recorded: dict[str, list[RecordedMessage]] = {topic: [] for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, POSE)}
-        recording.check(rules, recorded, whole=whole)
+        recording.check(contract(), recorded, whole=whole)
         for message in recording.messages(recorded):
             recorded[message.topic].append(message)
         for topic in (IMAGE, INFO, POSE):
@@ -50,9 +49,9 @@ class ReplayedCamera(Service):
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
         self._transforms = StaticTransforms()
         try:
-            for pose in _decode(recorded[POSE], rules.topics[POSE].type):  # each sender of a system publishes its own
+            for pose in _decode(recorded[POSE], contract().topics[POSE].type):  # each sender of a system publishes its own
                 self._transforms.add(pose.message.transforms)
-            first = decode(recorded[IMAGE][0].payload, rules.topics[IMAGE].type)
+            first = decode(recorded[IMAGE][0].payload, contract().topics[IMAGE].type)
             frame = first.header.frame_id.lstrip("/")
             self._pose = self._transforms.need(WORLD, frame)
             self.frames = _frames(recorded, IMAGE, INFO, frame)

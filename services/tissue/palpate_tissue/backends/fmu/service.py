@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_bus.contract import Contract, contract
+from palpate_bus.contract import Contract, contract as default_contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
@@ -45,18 +45,18 @@ class FmuService(Service):
         table: FmuMap,
         frames: Mapping[str, Array],
         scenario: Mapping[str, Any] | None = None,
-        rules: Contract | None = None,
+        contract: Contract | None = None,
     ) -> None:
-        rules = rules or contract()
-        if table.role not in rules.roles:
-            raise MapError(f"unknown role {table.role!r}; roles are {', '.join(rules.roles)}")
-        self._period = rules.roles[table.role].period
+        contract = contract or default_contract()
+        if table.role not in contract.roles:
+            raise MapError(f"unknown role {table.role!r}; roles are {', '.join(contract.roles)}")
+        self._period = contract.roles[table.role].period
         self._time = -self._period
         self._fmu = FmuInstance(fmu_file, table.start_s, table.parameters)
         self._fmu_offset = round(self._fmu.start_s * NS) + self._period
         """Time of the FMU minus that of the run [ns]."""
         try:
-            self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
+            self._wiring = Wiring(table, self._fmu, contract, frames, scenario or {})
         except UserError:
             self._fmu.close()  # removes the unpacked files
             raise

@@ -159,16 +159,16 @@ class Wiring:
     """Checks a map, an FMU and the contract against each other. Raises MapError with the entry that does not fit."""
 
     def __init__(
-        self, table: FmuMap, fmu: FmuInstance, rules: Contract, frames: Mapping[str, Array], scenario: Mapping[str, Any]
+        self, table: FmuMap, fmu: FmuInstance, contract: Contract, frames: Mapping[str, Array], scenario: Mapping[str, Any]
     ) -> None:
-        self._table, self._fmu, self._rules = table, fmu, rules
+        self._table, self._fmu, self._contract = table, fmu, contract
         self._frames = frames
         self._scenario = scenario
         for name, entries in table.inputs.items():
             if not entries:
                 _log.warning("inputs.%s: names no variable; the topic is left out", name)
         self.inputs = tuple(self._input(name, entries) for name, entries in table.inputs.items() if entries)
-        mine = {topic.name for topic in rules.outputs(table.role)}
+        mine = {topic.name for topic in contract.outputs(table.role)}
         if missing := mine - table.outputs.keys():
             raise MapError(f"the map lacks topics that the role {table.role} must send: {', '.join(sorted(missing))}")
         self.outputs = tuple(self._output(name, entries) for name, entries in table.outputs.items())
@@ -178,7 +178,7 @@ class Wiring:
             raise MapError(
                 f"{name}: the role {self._table.role} does not {what} this topic; it can {what} {', '.join(sorted(allowed))}"
             )
-        return self._rules.topics[name]
+        return self._contract.topics[name]
 
     def _variable(self, name: str, where: str) -> FmuVariable:
         try:
@@ -194,7 +194,7 @@ class Wiring:
         return {name: port for members in names.values() for port in [self._fmu.port(members)] for name in members}
 
     def _input(self, name: str, entries: Mapping[str, InputEntry]) -> InputTopic:
-        topic = self._topic(name, {row.name for row, _ in self._rules.inputs(self._table.role)}, "read")
+        topic = self._topic(name, {row.name for row, _ in self._contract.inputs(self._table.role)}, "read")
         chosen = {key: self._variable(key, f"{name}.{entry.field}") for key, entry in entries.items()}
         ports = self._ports(chosen.values())
         moves = []
@@ -209,7 +209,7 @@ class Wiring:
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
 
     def _output(self, name: str, entries: Mapping[str, OutputEntry]) -> OutputTopic:
-        topic = self._topic(name, {row.name for row in self._rules.outputs(self._table.role)}, "send")
+        topic = self._topic(name, {row.name for row in self._contract.outputs(self._table.role)}, "send")
         paths = {path: tuple(leaf.path for leaf in fields(topic.type, path)) for path in entries}
         sources = {path: f"{entry.variable or entry.scenario or entry.value} -> {name}.{path}" for path, entry in entries.items()}
         given = {path: entry.variable for path, entry in entries.items() if entry.variable is not None}
