@@ -89,8 +89,8 @@ def main() -> None:
         _run()
         sys.exit()
     except SystemExit as left:
-        if (why := lost_output()) and not left.code:
-            say(f"the output could not be written: {why}; all else was done")
+        if (reason := lost_output()) and not left.code:
+            say(f"the output could not be written: {reason}; all else was done")
             sys.exit(ExitStatus.TROUBLE)
         raise
 

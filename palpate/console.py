@@ -86,20 +86,20 @@ class CommandGroup(TyperGroup):
             refuse(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error)
 
 
-def say(why: object) -> None:
+def say(text: object) -> None:
     """Print a message to standard error."""
-    SteadyConsole(stderr=True).print(Text.assemble(("palpate:", "bold red"), f" {why}"), highlight=False, soft_wrap=True)
+    SteadyConsole(stderr=True).print(Text.assemble(("palpate:", "bold red"), f" {text}"), highlight=False, soft_wrap=True)
 
 
-def refuse(why: object) -> NoReturn:
+def refuse(text: object) -> NoReturn:
     """Print a message and exits with the status of bad input."""
-    say(why)
+    say(text)
     raise typer.Exit(ExitStatus.BAD_INPUT) from None
 
 
-def fail(why: object) -> NoReturn:
+def fail(text: object) -> NoReturn:
     """Print a message and exits with the status of a failure after the start."""
-    say(why)
+    say(text)
     raise typer.Exit(ExitStatus.FAILED) from None
 
 

@@ -77,8 +77,8 @@ def _states(count: int) -> str:
     number = f"continuous states: {count}"
     if count <= DENSE:
         return number
-    why = f"a solver with a dense Jacobian, such as FMPy's CVode, needs {8e-6 * count**2:.0f} MB for it"
-    return f"{number}: {why}; use solver='Euler' with steps of 1 ms, or a coarser mesh (--set phantom.edge_m=0.02)"
+    reason = f"a solver with a dense Jacobian, such as FMPy's CVode, needs {8e-6 * count**2:.0f} MB for it"
+    return f"{number}: {reason}; use solver='Euler' with steps of 1 ms, or a coarser mesh (--set phantom.edge_m=0.02)"
 
 
 @app.command()

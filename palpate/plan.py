@@ -56,8 +56,8 @@ def plan(
         refuse(error)
     console = SteadyConsole()
     console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
-    for why, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
-        console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)
+    for reason, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
+        console.print(f"{count} targets are left out: {reason}", highlight=False, soft_wrap=True)
     console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
 
 

@@ -244,8 +244,10 @@ def _list_files(metadata: Path) -> tuple[Path, ...]:
         files = tuple(metadata.parent / name for name in names)
         compression = str(info.get("compression_mode") or "").lower()
     except (RecordingError, LookupError, TypeError, AttributeError) as error:
-        why = str(error).partition("\n")[0]
-        raise RecordingError(f"{metadata}: is not rosbag2's description of a recording ({why}); give its .mcap file") from error
+        reason = str(error).partition("\n")[0]
+        raise RecordingError(
+            f"{metadata}: is not rosbag2's description of a recording ({reason}); give its .mcap file"
+        ) from error
     if compression == "message":
         raise RecordingError(f"{metadata}: compression_mode = message, want none or chunks of MCAP; {_convert(metadata.parent)}")
     for name, file in zip(names, files, strict=True):

@@ -160,11 +160,11 @@ class Settings(BaseModel):
             raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
         return self._check(dict(self) | changes)
 
-    def required(self, name: str, why: str) -> Any:
-        """Return the value of a setting that this process needs. Raises BusConfigError, with `why`, if it is not set."""
+    def required(self, name: str, advice: str) -> Any:
+        """Return the value of a setting that this process needs. Raises BusConfigError, with `advice`, if it is not set."""
         value = getattr(self, name)
         if value is None:
-            raise BusConfigError(f"{variable(name)} is not set; {why}")
+            raise BusConfigError(f"{variable(name)} is not set; {advice}")
         return value
 
     def to_env(self) -> dict[str, str]:

@@ -211,8 +211,8 @@ def parse_yaml(text: str, name: str, error: type[UserError] = InputError) -> Any
         reason = ", ".join(part for part in (problem.problem, problem.context) if part)
         raise error(f"{name}{where}: not YAML: {reason}") from problem
     except Exception as problem:  # a value that does not suit its tag raises many kinds: ValueError for 2001-13-45
-        why = str(problem) if isinstance(problem, ValueError) else f"a value does not suit its tag ({type(problem).__name__})"
-        raise error(f"{name}: not YAML: {why}") from problem
+        reason = str(problem) if isinstance(problem, ValueError) else f"a value does not suit its tag ({type(problem).__name__})"
+        raise error(f"{name}: not YAML: {reason}") from problem
 
 
 _TextT = TypeVar("_TextT", str, bytes)

@@ -66,10 +66,10 @@ def lies(results: Sequence[CaseResult]) -> str:
              f"{', '.join(f'{code} {count}' for code, count in codes)}.\n",
              table(("lie", "cases", *RANKS, "largest force [N]"), rows)]  # fmt: skip
     lines += [f"- **!** {f.target}: {f.ended}" for f in results if not f.passed]
-    lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]
+    lines += [f"- not detectable: {topic} {kinds or 'all'}: {reason}" for topic, kinds, reason in UNDETECTABLE]
     out = {topic.name: left_out(topic) for topic in contract().topics.values() if left_out(topic)} | LEFT_OUT
-    reasons = {why: [name for name in out if out[name] == why] for why in out.values()}
-    lines += [f"- left out, {why}: {', '.join(names)}" for why, names in reasons.items()]
+    reasons = {reason: [name for name in out if out[name] == reason] for reason in out.values()}
+    lines += [f"- left out, {reason}: {', '.join(names)}" for reason, names in reasons.items()]
     return "\n".join(lines) + "\n"
 
 

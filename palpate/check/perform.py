@@ -89,8 +89,8 @@ class LiveRig(Rig):
         end = monotonic() + seconds
         while self.role.name not in self._others():
             if monotonic() > end:
-                why = f"no node {self.role.name!r} appeared within {seconds:.0f} s"
-                raise NoBusError(f"{why}; it needs a liveliness token of that name")
+                reason = f"no node {self.role.name!r} appeared within {seconds:.0f} s"
+                raise NoBusError(f"{reason}; it needs a liveliness token of that name")
             self._say(RunControl.HELLO)
             sleep(TIMING.hello_s)
         self.expect("joins as a node of its role", True, self.role.name, self.role.name)
@@ -341,6 +341,6 @@ def print_report(report: ConformanceReport, failures: bool) -> None:
     verdict = ("conforms", "green") if report.passed else ("does not conform", "bold red")
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     if not report.passed and load > 1:
-        why = f"this machine is overloaded (load {load:.1f} per processor)"
-        out.print(f"\n{why}: rates and reaction times are unreliable", style="yellow")
+        reason = f"this machine is overloaded (load {load:.1f} per processor)"
+        out.print(f"\n{reason}: rates and reaction times are unreliable", style="yellow")
     out.print(Text.assemble(f"\n{report.role}: ", verdict, f", {summary}"))

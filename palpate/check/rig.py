@@ -166,9 +166,9 @@ class Rig(ABC):
         there = bool(received) if isinstance(received, list) else received is not None
         return self.expect(name, there, wanted, "as expected" if there else "nothing")
 
-    def skip(self, name: str, why: str) -> None:
+    def skip(self, name: str, reason: str) -> None:
         """Record a check that was not made."""
-        self.report.results.append(Result(self.report.group, name, Verdict.SKIPPED, "", why))
+        self.report.results.append(Result(self.report.group, name, Verdict.SKIPPED, "", reason))
 
     # -- messages
 

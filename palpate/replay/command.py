@@ -53,14 +53,14 @@ def replay(  # noqa: PLR0913 - the options of a command
 
     played: dict[str, object] = {"--topic": topics, "--listen": listen, "--hold": hold, "--drive": drive, "--rate": rate != 1.0}
     compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}
-    unused, why = {"--update-refs": update_refs, "--scenario": scenario, **compared}, "needs --service ROLE"
+    unused, reason = {"--update-refs": update_refs, "--scenario": scenario, **compared}, "needs --service ROLE"
     if update_refs is not None and service is not None:
-        unused, why = played | compared, "cannot be combined with --update-refs, which only writes"
+        unused, reason = played | compared, "cannot be combined with --update-refs, which only writes"
     elif service is not None:
         unused = {**played, "--from": begin, "--for": length}
-        why = "is for a recording that is played on the bus; --service compares all of it"
+        reason = "is for a recording that is played on the bus; --service compares all of it"
     for option in (name for name, value in unused.items() if value):
-        refuse(f"{option} {why}")
+        refuse(f"{option} {reason}")
     start = round(begin * NS)
     end = None if length is None else start + round(length * NS)
     if service is None:

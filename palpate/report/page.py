@@ -162,14 +162,14 @@ def _list_skipped(scenario: Scenario, report: Report, evidence: Evidence) -> lis
     X_AW = inverse(np.array(exam_input(scenario).X_WA))
     known = [] if evidence.collected.targets is None else evidence.collected.targets.positions
     rows = []
-    for number, why in sorted(reasons.items(), key=lambda item: int(item[0])):
+    for number, reason in sorted(reasons.items(), key=lambda item: int(item[0])):
         i = int(number)
         place = None
         if i < len(known):
             p = known[i]
             x, y, _ = apply(X_AW, np.array([(p.x, p.y, p.z)]))[0]
             place = (float(x), float(y))
-        rows.append({"number": i, "why": why, "place": place, "quadrant": "" if place is None else quadrant(*place)})
+        rows.append({"number": i, "reason": reason, "place": place, "quadrant": "" if place is None else quadrant(*place)})
     return rows
 
 

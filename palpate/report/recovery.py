@@ -61,7 +61,7 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
             raise archive.EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
         except Exception as error:  # a user-defined assessment, which may have ended the run
             note = f"; the assessment could not finish: {type(error).__name__}: {error}"
-    why = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
+    last = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
     text = f"recovered from an unfinished run: the recording ends at {recording.last / NS:.3f} s"
     text = "; ".join((text, *recording.damage))
     code = FailureCode.DAMAGED if recording.damage else FailureCode.UNFINISHED
@@ -69,7 +69,7 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
         runtime=RUNTIME,
         collected=collected,
         sim_time_s=recording.last / NS,
-        failure=Failure(code, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
+        failure=Failure(code, text + (f"; last: {last}" if last else "") + note, ("conductor",)),
         lost={"conductor": recording.last},
         earlier=tuple(one.collected for one in continued),
     )

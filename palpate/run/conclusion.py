@@ -82,8 +82,8 @@ def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report,
     try:
         other = another_folder()
         write_scenario_files(scenario, other)
-        report, page, why = _write_into(other, scenario, result)
-        return report, page, f"{trouble}; they are in {other}" + (f"; {why}" if why else "")
+        report, page, reason = _write_into(other, scenario, result)
+        return report, page, f"{trouble}; they are in {other}" + (f"; {reason}" if reason else "")
     except OSError as error:
         trouble += f", nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here"
         return assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier)), None, trouble
@@ -98,5 +98,5 @@ def _write_into(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Re
     except Exception as error:  # a user-defined assessment may send a map with invalid triangles
         log.exception("the map cannot be used")
         result.collected.stiffness_map = None
-        why = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"
-        return write_results(folder, scenario, result), write_page(folder), why
+        reason = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"
+        return write_results(folder, scenario, result), write_page(folder), reason

@@ -92,8 +92,8 @@ def _announce(console: Console, scenario: Scenario, options: RunOptions, folder:
     hints = [what_it_takes(scenario.exam, options.record)]
     if not options.composed:
         hints.append("to look at it from another terminal: palpate doctor, palpate topic list")
-    if options.record != "none" and (why := _missing_for_dashboard(scenario)):
-        hints.append(f"for palpate dashboard, now or of the finished run, {why}")
+    if options.record != "none" and (reason := _missing_for_dashboard(scenario)):
+        hints.append(f"for palpate dashboard, now or of the finished run, {reason}")
     for hint in hints:
         console.print(hint, style="dim", highlight=False, soft_wrap=True)
 
@@ -101,7 +101,7 @@ def _announce(console: Console, scenario: Scenario, options: RunOptions, folder:
 def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:
     """Raise UserError for options that exclude each other."""
     o, shared = options, bool(options.group) or options.processes is not None
-    for contradiction, why in (
+    for contradiction, reason in (
         (o.composed and (o.realtime or o.wallclock), "--composed runs as fast as it can: without --realtime and --wallclock"),
         (scenario.services.tissue == NONE and not o.wallclock, NEEDS_WALLCLOCK),
         (o.without and o.composed, "--without ROLE leaves out a process: it goes without --composed"),
@@ -112,7 +112,7 @@ def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:
         (o.keys and not o.secure, "--keys goes with --secure"),
     ):
         if contradiction:
-            raise UserError(why)
+            raise UserError(reason)
 
 
 def _run(

@@ -48,8 +48,8 @@ def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
     for group, text in zip(together, groups, strict=True):
         for role in group:
             if role not in workers:
-                why = "an observer has its own process" if role in contract().roles else f"there is no role {role!r}"
-                raise UserError(f"--group {text}: {why}; allowed are {', '.join(workers)}")
+                reason = "an observer has its own process" if role in contract().roles else f"there is no role {role!r}"
+                raise UserError(f"--group {text}: {reason}; allowed are {', '.join(workers)}")
             if role in placed:
                 raise UserError(f"--group {text}: {role} is in a group already")
             placed.append(role)

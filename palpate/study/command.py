@@ -150,8 +150,8 @@ def scenario_of_case(
     try:
         outcome = Outcome.model_validate_json(case.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not an outcome of this version"
-        refuse(f"{case} is not a case of a study ({why}): want a file such as out/study/NAME-SPLIT/cases/ID.json")
+        reason = error.strerror if isinstance(error, OSError) else "not an outcome of this version"
+        refuse(f"{case} is not a case of a study ({reason}): want a file such as out/study/NAME-SPLIT/cases/ID.json")
     print(dump_scenario(Scenario.model_validate(outcome.case.scenario)), end="")
 
 
@@ -185,13 +185,13 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
             display.show(0, todo, "")
 
             def done(outcome: Outcome) -> None:
-                why = "" if outcome.completed else f": {outcome.why}"
-                display.show(next(finished), todo, f"{outcome.case.label}{why}")
+                reason = "" if outcome.completed else f": {outcome.why}"
+                display.show(next(finished), todo, f"{outcome.case.label}{reason}")
 
             run_cases(folder, cases, workers, done, runs=runs)
     except (StudyStopped, KeyboardInterrupt) as error:
-        why = "stopped" if isinstance(error, KeyboardInterrupt) else error
-        fail(f"{why}: {len(folder.missing(cases))} of {len(cases)} cases are left; run the same command to continue")
+        reason = "stopped" if isinstance(error, KeyboardInterrupt) else error
+        fail(f"{reason}: {len(folder.missing(cases))} of {len(cases)} cases are left; run the same command to continue")
 
 
 def _conclude(folder: Folder, manifest: Manifest) -> None:
@@ -208,8 +208,8 @@ def _conclude(folder: Folder, manifest: Manifest) -> None:
     incomplete = [outcome for outcome in outcomes if not outcome.completed]
     for outcome in incomplete[:SHOWN]:
         tried = f" (attempts: {'; '.join(outcome.failures)})" if outcome.status == "failed" else ""
-        why = outcome.why or "nothing was assessed"
-        out.print(f"{outcome.case.label}: {why}{tried}", highlight=False, soft_wrap=True)
+        reason = outcome.why or "nothing was assessed"
+        out.print(f"{outcome.case.label}: {reason}{tried}", highlight=False, soft_wrap=True)
     if len(incomplete) > SHOWN:
         out.print(f"... and {len(incomplete) - SHOWN} more that did not complete", highlight=False)
     out.print(f"page: {folder.path / 'study.html'}", highlight=False, soft_wrap=True)

@@ -125,9 +125,9 @@ class Monitor:
             self._check_stamp(topic, stream, sequence, stamp, now)
             stream.stamp = stamp
 
-    def garbage(self, name: str, why: str, now: float) -> None:
+    def garbage(self, name: str, got: str, now: float) -> None:
         """Note bytes on a topic that are not a message."""
-        self._note(self.contract.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
+        self._note(self.contract.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", got, now)
 
     def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes, now: float) -> None:
         """Note a message on a topic's key with another type or hash."""

@@ -99,9 +99,9 @@ class Composed:
                 self._send(sent, t)
         self.t = t + self._group.period
 
-    def _leave_out(self, role: str, t: int, why: str) -> None:
+    def _leave_out(self, role: str, t: int, reason: str) -> None:
         self.lost[role] = t
-        self.trouble.append(f"{role} lost at {t / 1e9:.3f} s: {why}")
+        self.trouble.append(f"{role} lost at {t / 1e9:.3f} s: {reason}")
 
     def run(self, end: Callable[[], int | None], limit: int) -> int:
         """Run up to and including the tick [ns] that `end()` returns once known, at most to `limit`; return the last tick."""

@@ -166,9 +166,9 @@ class ConductorLink:
             self._pid = int(message.tick) if message.reason == pid_space() else 0
         self._on_message()
 
-    def _lose(self, why: str) -> None:
-        self.lost, self._lost_at = why, monotonic()
-        log.warning(CONDUCTOR_LOST_LOG, why)
+    def _lose(self, reason: str) -> None:
+        self.lost, self._lost_at = reason, monotonic()
+        log.warning(CONDUCTOR_LOST_LOG, reason)
 
     @property
     def garbage(self) -> int:
@@ -194,13 +194,13 @@ class Reports:
         message = ServiceReport(state, self._member.role, tick, waiting_for, text)
         self._publisher.put(self._encode(message), self._sequence)
 
-    def conductor_lost(self, tick: int, why: str) -> None:
+    def conductor_lost(self, tick: int, reason: str) -> None:
         """Report that the conductor is lost, for the case that it returns."""
-        self.send(ServiceReport.PROGRESS, tick, CONDUCTOR, {"conductor_lost": why})
+        self.send(ServiceReport.PROGRESS, tick, CONDUCTOR, {"conductor_lost": reason})
 
-    def aborted(self, tick: int, why: str) -> None:
+    def aborted(self, tick: int, reason: str) -> None:
         """Report that the service leaves on an ABORT message, so that the conductor detects a forged one."""
-        self.send(ServiceReport.PROGRESS, tick, "", {"ended_by": why})
+        self.send(ServiceReport.PROGRESS, tick, "", {"ended_by": reason})
 
     def progress(self, tick: int, waiting_for: str = "") -> None:
         """Report progress if the last report is old enough, with new suspicions about senders."""

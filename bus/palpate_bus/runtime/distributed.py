@@ -213,8 +213,8 @@ class RemoteInputs:
             while not doubled and (later := self._data[buffer.topic.name].get(max(end - monotonic(), 0.0))) is not None:
                 doubled = later.sequence <= sample.sequence and later.sent != sample.sent
             if doubled:
-                name, why = buffer.topic.name, f"{error}; two senders share an identity"
-                text = f"{why}: a forged or doubled sender of {name}, not a loss of {buffer.topic.producer}"
+                name, reason = buffer.topic.name, f"{error}; two senders share an identity"
+                text = f"{reason}: a forged or doubled sender of {name}, not a loss of {buffer.topic.producer}"
                 raise ForgedSenderError(text, name) from None
             raise
         self._last[buffer.topic.name] = (sample.sequence, sample.sent)

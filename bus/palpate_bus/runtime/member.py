@@ -80,7 +80,7 @@ class Member:
 
     def suspicions(self) -> list[str]:
         """Return new suspicions about the senders of this role's inputs, and its new notes, each once."""
-        found = [f"{name}: {why}" for name, subscription in self._subscriptions if (why := subscription.suspicion)]
+        found = [f"{name}: {suspicion}" for name, subscription in self._subscriptions if (suspicion := subscription.suspicion)]
         new = [text for text in (*found, *self._noted) if text not in self._reported]
         self._noted.clear()
         self._reported.update(new)

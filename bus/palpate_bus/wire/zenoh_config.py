@@ -135,8 +135,8 @@ def _check_endpoint(endpoint: str) -> None:
     if not (protocol and slash and address):
         raise BusConfigError(f"endpoint {endpoint!r} is not <protocol>/<address>, like tcp/127.0.0.1:7447")
     if protocol == "unixsock-stream" and len(os.fsencode(address)) > UNIX_PATH_MAX_BYTES:
-        why = f"the path of a unix socket has at most {UNIX_PATH_MAX_BYTES} bytes; choose a shorter folder"
-        raise BusConfigError(f"endpoint {endpoint!r}: {why}")
+        reason = f"the path of a unix socket has at most {UNIX_PATH_MAX_BYTES} bytes; choose a shorter folder"
+        raise BusConfigError(f"endpoint {endpoint!r}: {reason}")
 
 
 def zenoh_config(options: BusOptions) -> zenoh.Config:

@@ -252,8 +252,8 @@ class Conductor:
                     self._keep_slot_or_lose(role, Failure(FailureCode.ROLE_LOST, how))
             self._lose_frozen(finished)
             for role, how in self._slots.expired().items():
-                why = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
-                self._mark_lost(role, Failure(FailureCode.ROLE_LOST, why))
+                reason = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
+                self._mark_lost(role, Failure(FailureCode.ROLE_LOST, reason))
             self._notify(*self._member.complaints(), *self._member.suspicions())
             self._operator_requests.poll(self._collector.collected.supervisor)
             self._watch.poll()
@@ -307,8 +307,8 @@ class Conductor:
             role, text = self.watchdog.culprit(roles)
             raise RunFailed(FailureCode.BLOCKED, f"{role} blocks the run for {stalled:.0f} s: {text}", role)
         if stalled > self._patience.soft and not self._warned:
-            why = self.watchdog.culprit(roles)[1]
-            self._notify(f"no tick for {stalled:.0f} s, waiting {self._patience.hard:.0f} s at most: {why}")
+            reason = self.watchdog.culprit(roles)[1]
+            self._notify(f"no tick for {stalled:.0f} s, waiting {self._patience.hard:.0f} s at most: {reason}")
         self._warned = stalled > self._patience.soft
 
     # -- lost services
@@ -374,13 +374,13 @@ class Conductor:
             tick = self.watchdog.progress[self._workers[0]].tick
             self._on_heartbeat_timeout("", tick, "the services left without it")
 
-    def _on_heartbeat_timeout(self, role: str, tick: int, why: str) -> None:
+    def _on_heartbeat_timeout(self, role: str, tick: int, reason: str) -> None:
         """End the examination: the service `role`, if known, received no heartbeat of this conductor for the deadline."""
         if CONDUCTOR in self.result.lost:
             return
         self.result.lost[CONDUCTOR] = max(tick, 0)
         stood = f"; it stood still for {self._heartbeat.stood_still_s:.1f} s" if self._heartbeat.stood_still_s else ""
-        reported = f"{role} reports: {why}" if role else why
+        reported = f"{role} reports: {reason}" if role else reason
         text = f"conductor lost at {max(tick, 0) / NS:.3f} s: {reported}{stood}"
         self._notify(text)
         self.result.failure = Failure(FailureCode.CONDUCTOR_LOST, text, (CONDUCTOR,))

@@ -118,8 +118,8 @@ class FreezeWatch:
         if activity is not None and is_running(activity.pid):
             sleep(TUNING.exit_s)
             if is_running(activity.pid):
-                why = "the connection broke, or the machine is overloaded"
-                return f"its connection closed, but its process {activity.pid} runs: {why}"
+                reason = "the connection broke, or the machine is overloaded"
+                return f"its connection closed, but its process {activity.pid} runs: {reason}"
         return "its connection closed"
 
     def frozen(self) -> dict[str, str]:

@@ -164,9 +164,9 @@ class ControlService(Service):
             self._pending.append(setpoint)
         self._setpoint_expires = min(setpoint.stamp, t) + min(nanoseconds(message.valid_for), self._setpoint_expiry)
 
-    def _refuse(self, t: int, why: str) -> None:
+    def _refuse(self, t: int, reason: str) -> None:
         self._facts["setpoints_rejected"] += 1
-        self._refused = Problem(TOPIC, f"{TOPIC} refused: {why}")
+        self._refused = Problem(TOPIC, f"{TOPIC} refused: {reason}")
         self._problem = f"at {t} ns: {self._refused.text}"
 
     def _too_far(self, setpoint: Setpoint, q: Array) -> str:

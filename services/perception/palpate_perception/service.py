@@ -211,19 +211,19 @@ def _intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
 def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
     """Return the answer to a burst of which no frame could be used."""
     if burst.wrong:
-        reason, why = ViewReason.BAD_FRAMES, burst.wrong
+        reason, text = ViewReason.BAD_FRAMES, burst.wrong
     elif inbox.lost("camera"):
-        reason, why = ViewReason.NO_CAMERA, "the camera service has left the run"
+        reason, text = ViewReason.NO_CAMERA, "the camera service has left the run"
     elif burst.waiting and inbox.latest("tf_static") is None:
-        reason, why = ViewReason.NO_CALIBRATION, "frames received, but no tf_static with the camera's pose"
+        reason, text = ViewReason.NO_CALIBRATION, "frames received, but no tf_static with the camera's pose"
     elif burst.waiting:
         reason, frame = ViewReason.NO_CALIBRATION, burst.waiting[0].header.frame_id
-        why = f"frames received, but no camera/depth/camera_info or no pose of {frame!r} in world"
+        text = f"frames received, but no camera/depth/camera_info or no pose of {frame!r} in world"
     else:
         reason = ViewReason.NO_FRAMES
-        why = f"no frame on camera/depth/image_raw within {TIMES.frame_wait_ns / NS:.0f} s of the expected end of the burst"
+        text = f"no frame on camera/depth/image_raw within {TIMES.frame_wait_ns / NS:.0f} s of the expected end of the burst"
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
-    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"no surface: {why}")
+    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"no surface: {text}")
 
 
 def targets(t: int, perceived: Perceived) -> Message:

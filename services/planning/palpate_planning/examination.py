@@ -324,9 +324,9 @@ class ExaminationSequence:
         if more and (palpation.moved or cause.reason is Reason.NO_TISSUE) and remainder.rescans < EXAM.rescans_max:
             remainder.rescans, remainder.wanted, remainder.bend = remainder.rescans + 1, wanted, None
             remainder.looked_again = remainder.looked_again or not palpation.moved
-            why = MOVED if palpation.moved else cause
+            cause = MOVED if palpation.moved else cause
             self._views.restart()
-            course.enter(Phase.LOOK, now.t, f"{why.text}: looking again", why)
+            course.enter(Phase.LOOK, now.t, f"{cause.text}: looking again", cause)
         elif more and cause.reason in REPLANNED and remainder.replans < EXAM.replans_max:
             remainder.replans, remainder.wanted = remainder.replans + 1, wanted
             remainder.bend = max(remainder.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)

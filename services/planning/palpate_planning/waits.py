@@ -26,9 +26,9 @@ class Wait(NamedTuple):
     end: Cause
 
 
-def _wait(reason: Reason, text: str, end: Reason, why: str, culprit: str = "") -> Wait:
+def _wait(reason: Reason, text: str, end: Reason, end_text: str, culprit: str = "") -> Wait:
     limit = f"{WAIT.limit_s:g} s"
-    return Wait(Cause(reason, f"{text}, {limit} at most", culprit), Cause(end, f"{why} ({limit} of waiting)", culprit))
+    return Wait(Cause(reason, f"{text}, {limit} at most", culprit), Cause(end, f"{end_text} ({limit} of waiting)", culprit))
 
 
 FOR_WALL: Final = _wait(
@@ -93,7 +93,7 @@ class StrokeWaits:
             self._waited_s.clear()
 
     def step(self, wait: Wait | None) -> Cause:
-        """Count a period that waits for `wait`, if anything; return why the strokes end, if they do."""
+        """Count a period that waits for `wait`, if anything; return the cause of the end, if the strokes end."""
         self.reported = NO_CAUSE
         if wait is None:
             return NO_CAUSE

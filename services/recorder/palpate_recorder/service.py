@@ -89,9 +89,9 @@ class RecorderService(Service):
         except OSError as error:
             self._stop(stamp, f"its folder is lost: {error.strerror}")
 
-    def _stop(self, stamp: int, why: str) -> None:
+    def _stop(self, stamp: int, reason: str) -> None:
         """Complete the recording."""
-        self.trouble = f"recorder: the recording ends at {stamp / 1e9:.3f} s: {why}"
+        self.trouble = f"recorder: the recording ends at {stamp / 1e9:.3f} s: {reason}"
         log.error("%s", self.trouble)
         with suppress(OSError):
             self._bag.close()

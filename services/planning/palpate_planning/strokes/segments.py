@@ -109,21 +109,21 @@ class SegmentPlanner:
             self._R_ref = self._kinematics.pose(self._postures[pieces[0].targets[0]])[:3, :3]
         for k, piece in enumerate(pieces):
             path, infeasible = self._stroke(piece)
-            for sample, why in infeasible:
+            for sample, cause in infeasible:
                 after = int(np.searchsorted(piece.visits, sample, side="right")) - 1
                 target = int(piece.targets[after])
                 if sample == piece.visits[after]:
-                    layout.dropped[target] = why
+                    layout.dropped[target] = cause
                 else:
                     layout.breaks.add(target)
             for end in (0, -1):
-                posture, why = self.hover(piece, end)
+                posture, cause = self.hover(piece, end)
                 if posture is None:
-                    layout.dropped[int(piece.targets[end])] = why._replace(text=f"posture above it: {why.text}")
+                    layout.dropped[int(piece.targets[end])] = cause._replace(text=f"posture above it: {cause.text}")
             if k and not layout.infeasible:
-                segment, why = self._path_to_next(pieces[k - 1], piece)
+                segment, cause = self._path_to_next(pieces[k - 1], piece)
                 if segment is None:
-                    layout.dropped[int(piece.targets[0])] = why._replace(text=f"no path to it: {why.text}")
+                    layout.dropped[int(piece.targets[0])] = cause._replace(text=f"no path to it: {cause.text}")
                 else:
                     layout.segments.append(segment)
             layout.segments.append(Segment(path, contact=True, touch=piece.touch))
@@ -138,7 +138,7 @@ class SegmentPlanner:
         return () if transit is None else (transit, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> tuple[Array | None, Cause]:
-        """Return the posture above the first (0) or last (-1) target [rad], shape (n,), or None and why there is none."""
+        """Return the posture above the first (0) or last (-1) target [rad], shape (n,), or None and the cause."""
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))

@@ -102,10 +102,10 @@ class FriSession:
     def _enter(self, state: SessionState) -> None:
         self.state, self._in_state = state, 0.0
 
-    def end(self, why: str) -> None:
+    def end(self, reason: str) -> None:
         """End the session."""
         if not self.ended:
-            self.ended = why
+            self.ended = reason
             self._enter(SessionState.IDLE)
 
     def take(self, position: Array, torque: Array) -> None:
