@@ -59,7 +59,7 @@ def gather(into: Path) -> None:
     )
     files = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).is_file()]
     pages = {file: (ROOT / file).read_text(encoding="utf-8") for file in files if file.suffix == ".md"}
-    pages |= generated()
+    pages |= generate_pages()
     for page in pages:
         target = into / ("index.md" if page == Path("README.md") else page)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def gather(into: Path) -> None:
         study(ROOT / "docs" / "studies" / name, command, into / "docs" / "studies" / name)
 
 
-def generated() -> dict[Path, str]:
+def generate_pages() -> dict[Path, str]:
     """Return the generated pages by their path in the repository."""
     if (folder := str(ROOT / "docs")) not in sys.path:
         sys.path.insert(0, folder)

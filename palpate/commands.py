@@ -125,7 +125,7 @@ def app_for(name: str, columns: int | None = None) -> typer.Typer:
         return app
     for group, commands in GROUPS.items():
         for listed, where in commands.items():
-            app.command(listed, help=_summary(where), rich_help_panel=group)(_listed)
+            app.command(listed, help=_summary(where), rich_help_panel=group)(_placeholder)
     return app
 
 
@@ -143,7 +143,7 @@ def _options(
     """Callback of the app: with it, an app of one command still requires that command's name."""
 
 
-def _listed() -> None:
+def _placeholder() -> None:
     """Placeholder for a command in the list of commands."""
 
 

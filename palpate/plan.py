@@ -126,16 +126,16 @@ def summary(exam: Exam, planned: Prospect) -> str:
     """Return the numbers of targets or presses, lines, strokes and touches, and the duration, as a line."""
     from palpate_models.scenario.schema import Mode
 
-    targets, touches = len(planned.scan.targets), _counted(len(planned.touches), "touch", "touches")
+    targets, touches = len(planned.scan.targets), _count_text(len(planned.touches), "touch", "touches")
     time = f"{planned.duration_s:.0f} s of simulated time"
     if exam.searched:
         return f"{targets} places, at most {exam.budget.presses} presses; {touches} before the search; at most {time}"
-    lines, strokes = _counted(len(planned.scan.lines), "line"), _counted(len(planned.strokes), "stroke")
+    lines, strokes = _count_text(len(planned.scan.lines), "line"), _count_text(len(planned.strokes), "stroke")
     slides = f"{planned.length_m:.2f} m of sliding" if exam.mode is Mode.CONTINUOUS else "pressed one by one"
     return f"{targets} targets in {lines}, palpated in {strokes}; {slides}, {touches} before; about {time}"
 
 
-def _counted(number: int, one: str, many: str = "") -> str:
+def _count_text(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
@@ -173,7 +173,7 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     exam = scenario.exam
-    how = f"{Path(exam.pattern).stem}, {exam.mode}, {_counted(len(planned.strokes), 'stroke')}, about"
+    how = f"{Path(exam.pattern).stem}, {exam.mode}, {_count_text(len(planned.strokes), 'stroke')}, about"
     how = f"search, at most {exam.budget.presses} presses, at most" if exam.searched else how
     axes.set_title(f"{scenario.name}: {how} {planned.duration_s:.0f} s", parse_math=False)
     figure.savefig(path)

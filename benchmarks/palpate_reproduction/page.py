@@ -56,7 +56,7 @@ def measure(case: ReproductionCase, folder: Path) -> tuple[MeasuredWay, Evidence
     ), evidence
 
 
-def chosen_moments(evidence: Evidence) -> list[tuple[str, float, bool]]:
+def choose_moments(evidence: Evidence) -> list[tuple[str, float, bool]]:
     """Return title, time [s] and viewpoint (True: close) of the pictures of figure 6."""
     spans: dict[int, tuple[float, float]] = {}
     for phase, begin, end in evidence.phases():
@@ -102,7 +102,7 @@ def write_page(
     nodes, topics = figures.graph(images / "figure-5-graph.png", rows, WATCHING)
     ways, evidence = zip(*(measure(case, runs / case.name) for case in cases), strict=True)
     show("figure 6: phases")
-    chosen = chosen_moments(evidence[0])
+    chosen = choose_moments(evidence[0])
     recording = recording_of(folder)
     if not recording:
         raise ReproductionError(f"{folder}: no recording")

@@ -91,7 +91,7 @@ def sample_persons(persons: int = SETUP.persons, build: Build = Build.MEDIAN) ->
     return sample_of(np.repeat(np.arange(persons), SETUP.places).tolist(), np.array(force))
 
 
-def left_out(people: pd.DataFrame) -> NDArray[np.bool_]:
+def inside_interval(people: pd.DataFrame) -> NDArray[np.bool_]:
     """Return for each position whether it is in the 80 % interval that the other people predict for a new person, shape (n,).
 
     ln F is normal between people and between positions of one person; the interval is Student's, for the mean of a few people.
@@ -125,7 +125,7 @@ def section(found: pd.DataFrame | None = None) -> PageSection:
         Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
         for (name, ours), theirs, within in zip(figures(found).items(), figures(people).values(), WITHIN, strict=True)
     )
-    covered = float(left_out(people).mean())
+    covered = float(inside_interval(people).mean())
     checks += (Check(LEFT_OUT, covered, "of all", against=f"{len(people)} places of {people['person'].nunique()} people"),)
     text = (
         "This is a check of the sampler, whose moments come from the same ten people, and no validation of other persons. "

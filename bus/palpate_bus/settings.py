@@ -1,7 +1,7 @@
 """Settings of a process: how it runs and joins the bus, from PALPATE_ environment variables.
 
     settings = Settings.read()                                  from this process's environment
-    child = settings.replaced(runtime="wallclock", record="full")
+    child = settings.replace(runtime="wallclock", record="full")
     subprocess.Popen(command, env={**os.environ, **child.to_env()})
 
 No other module reads PALPATE_ variables. The scenario, not the settings, says what is examined and how.
@@ -154,13 +154,13 @@ class Settings(BaseModel):
         given = os.environ if environ is None else environ
         return cls._check({name: given[variable(name)] for name in cls.model_fields if given.get(variable(name))})
 
-    def replaced(self, **changes: Any) -> Self:
+    def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed. Raises BusConfigError."""
         if unknown := changes.keys() - type(self).model_fields.keys():
             raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
         return self._check(dict(self) | changes)
 
-    def required(self, name: str, advice: str) -> Any:
+    def require(self, name: str, advice: str) -> Any:
         """Return the value of a setting that this process needs. Raises BusConfigError, with `advice`, if it is not set."""
         value = getattr(self, name)
         if value is None:
@@ -203,10 +203,10 @@ def _complaint(error: Any) -> str:
     """Return an error of pydantic as text: variable, value, allowed values."""
     name = str(error["loc"][0])
     problem = error["msg"].removeprefix("Value error, ") + "; " if error["type"] == "value_error" else ""
-    return f"{variable(name)} is {error['input']!r}; {problem}allowed: {allowed(name)}"
+    return f"{variable(name)} is {error['input']!r}; {problem}allowed: {allowed_values(name)}"
 
 
-def allowed(name: str) -> str:
+def allowed_values(name: str) -> str:
     """Return the allowed values of a setting as text."""
     field = Settings.model_fields[name]
     kind = typing.get_args(field.annotation)[0] if isinstance(field.annotation, types.UnionType) else field.annotation

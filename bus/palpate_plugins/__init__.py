@@ -138,7 +138,7 @@ class PluginKind(NamedTuple):
             tree = ast.parse(read_text(path), str(path))
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise self._error(str(path), f"is not Python: {error}") from error
-        if self.function not in _defined(tree):
+        if self.function not in _top_level_names(tree):
             raise self._error(str(path), f"the file has no function {self.function}({self.arguments})")
 
     def _load_file(self, choice: str) -> Callable[..., Any]:
@@ -189,7 +189,7 @@ def _installed(name: str) -> bool:
     return True
 
 
-def _defined(tree: ast.Module) -> set[str]:
+def _top_level_names(tree: ast.Module) -> set[str]:
     """Return the names that a module defines or imports at its top level."""
     found: set[str] = set()
     for node in tree.body:

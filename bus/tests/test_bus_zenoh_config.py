@@ -179,10 +179,10 @@ def test_environment_is_read_with_types_and_written_back() -> None:
 
 def test_process_reads_its_own_environment_and_a_child_gets_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_ROUTER", "tcp/host:7447")
-    child = Settings.read().replaced(runtime="wallclock", router=None)
+    child = Settings.read().replace(runtime="wallclock", router=None)
     assert child.runtime == "wallclock"
     assert child.to_env()["PALPATE_ROUTER"] == ""  # undoes the inherited one
-    assert Settings.read({}) == Settings.read({}).replaced()
+    assert Settings.read({}) == Settings.read({}).replace()
 
 
 @pytest.mark.parametrize(
@@ -208,11 +208,11 @@ def test_wrong_value_is_refused_with_what_is_allowed(
 
 def test_wrong_change_and_missing_setting_are_refused() -> None:
     with pytest.raises(BusConfigError, match="there is no setting speed"):
-        Settings.read({}).replaced(speed=3)
+        Settings.read({}).replace(speed=3)
     with pytest.raises(BusConfigError, match="PALPATE_RUNTIME is 'fast'"):
-        Settings.read({}).replaced(runtime="fast")
+        Settings.read({}).replace(runtime="fast")
     with pytest.raises(BusConfigError, match="PALPATE_OUT is not set; give it the run's folder"):
-        Settings.read({}).required("out", "give it the run's folder")
+        Settings.read({}).require("out", "give it the run's folder")
 
 
 TEXT = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_text(encoding="utf-8")

@@ -153,7 +153,7 @@ def follow(run: Run, service: DashboardService, report: Callable[[str], None], k
         while not end:
             if not observed.drain_and_step():
                 sleep(LIMITS.idle_s)
-            for word in keys.pressed():
+            for word in keys.read_requests():
                 report(order(operator, run.domain, word, "a key of palpate dashboard", key))
             while (sample := control.get(0)) is not None:
                 message = decode(sample.payload)

@@ -296,5 +296,5 @@ def create(scenario: Scenario) -> DashboardService:
     `viewer` is invalid.
     """
     settings = Settings.read()
-    out = settings.required("out", f"the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
+    out = settings.require("out", f"the dashboard writes $PALPATE_OUT/{FILE}, so give it the run's folder")
     return DashboardService(scenario, out / FILE, Live.parse(settings.viewer or ""), full=settings.record == "full")

@@ -72,7 +72,7 @@ from palpate_bus.runs.operator import OperatorKeys
 with OperatorKeys() as keys:
     print("attached" if keys.attached else "not attached", flush=True)
     while True:
-        for word in keys.pressed():
+        for word in keys.read_requests():
             print(word, flush=True)
         time.sleep(0.01)
 """
@@ -120,7 +120,7 @@ def test_without_a_terminal_no_key_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
         monkeypatch.setattr("sys.stdin", file)
         with OperatorKeys() as keys:
             assert not keys.attached
-            assert keys.pressed() == []
+            assert keys.read_requests() == []
         assert file.read() == "ser"
 
 

@@ -1,7 +1,7 @@
 """docs/settings.md, from the settings of a process."""
 
 from generate import table
-from palpate_bus.settings import COMPOSE_VARIABLES, Settings, allowed, text, variable
+from palpate_bus.settings import COMPOSE_VARIABLES, Settings, allowed_values, text, variable
 
 _HEAD = """# Settings
 
@@ -16,7 +16,7 @@ says what is examined and how.
 def page() -> str:
     """Return the page."""
     rows = [
-        (f"`{variable(name)}`", allowed(name), _code(text(field.get_default())), field.description or "")
+        (f"`{variable(name)}`", allowed_values(name), _code(text(field.get_default())), field.description or "")
         for name, field in Settings.model_fields.items()
     ]
     rows += [(f"`{name}`", "docker compose only", _code(default), doc) for name, (default, doc) in COMPOSE_VARIABLES.items()]

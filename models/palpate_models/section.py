@@ -29,13 +29,13 @@ UNITS: Final = {
 _T = TypeVar("_T")
 
 
-def _ordered(ends: tuple[Any, Any]) -> tuple[Any, Any]:
+def _check_order(ends: tuple[Any, Any]) -> tuple[Any, Any]:
     if ends[0] > ends[1]:
         raise ValueError("want the smaller value first")
     return ends
 
 
-Ends = Annotated[tuple[_T, _T], AfterValidator(_ordered)]
+Ends = Annotated[tuple[_T, _T], AfterValidator(_check_order)]
 """Minimum and maximum of a range."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]

@@ -18,7 +18,7 @@ def test_the_modulus_is_the_derivative_of_the_pressure_and_the_pressure_of_the_e
     du = 1e-6 * corner
     slope = (wall.stress(u + du, beta) - wall.stress(u - du, beta)) / (2 * du)
     np.testing.assert_allclose(slope, wall.slope(u, beta), rtol=1e-5, atol=1e-5)
-    stress = (wall.stored(u + du, beta) - wall.stored(u - du, beta)) / (2 * du)
+    stress = (wall.stored_energy(u + du, beta) - wall.stored_energy(u - du, beta)) / (2 * du)
     np.testing.assert_allclose(stress, wall.stress(u, beta), rtol=1e-5, atol=1e-5 * corner)
 
 

@@ -114,7 +114,7 @@ class LiveRig(Rig):
             for publisher in self._publishers.values():
                 publisher.hello()
             sleep(TIMING.hello_s)
-            for message in self._received_reports():
+            for message in self._receive_reports():
                 if message.state == ServiceReport.READY:
                     missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
         self.ready = missing == []
@@ -145,7 +145,7 @@ class LiveRig(Rig):
         self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
         end = monotonic() + TIMING.finish_s
         while not self.finished and monotonic() < end:
-            self._received_reports()
+            self._receive_reports()
             self._drain()
             sleep(0.02)
         got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
@@ -173,14 +173,14 @@ class LiveRig(Rig):
             self._session.put(key, b"\xff" * 40, attachment=stranger(1, time_ns()))
             self._next(name, b"\x00\x01\x00\x00\xff")
         after = self.run(0.6, {})
-        self._received_reports()
+        self._receive_reports()
         silent = [t.name for t in self.contract.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
         there = self.role.name in self._others()
         states = {"gone": not there, f"silent on {', '.join(silent)}": silent, f"failed: {self.error}": self.error}
         got = next((text for text, so in states.items() if so), "continues")
         self.equal("garbage on its inputs does not stop it", got, "continues")
 
-    def _received_reports(self) -> list[Any]:
+    def _receive_reports(self) -> list[Any]:
         received = []
         while (sample := self._reports.get(0)) is not None:
             try:
@@ -219,7 +219,7 @@ class LiveRig(Rig):
             self._drain()
             if monotonic() - self._last_control > TIMING.control_s:
                 self._say(RunControl.GRANT, self._epoch)
-                self._received_reports()
+                self._receive_reports()
             if now >= end:
                 return
             sleep(max(0.0, (MS - (time_ns() - self._epoch) % MS) / NS))
@@ -279,7 +279,7 @@ def start_implementation(command: str | None, role: str, settings: RigSettings, 
                         child.wait(timeout=5)
 
 
-def _shown(rig: Rig) -> TimeLeft:
+def _progress_bar(rig: Rig) -> TimeLeft:
     """Return a bar that follows the clock of a rig."""
     role, report = rig.role.name, rig.report
     return TimeLeft(lambda: f"{role}: {report.group}, {len(report.results)} checks", lambda: rig.t / NS, 0.0, SUITES[role])
@@ -296,7 +296,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
 
     def perform() -> ConformanceReport:
         rig = ServiceRig(implementations.create(role, choice, settings.scenario), settings, steps)
-        with _shown(rig):
+        with _progress_bar(rig):
             return check(rig)
 
     limits = Settings.read()
@@ -315,7 +315,7 @@ def check_live(
         try:
             with start_implementation(start, role, settings, where, domain):
                 rig.await_implementation(wait)
-                with _shown(rig):
+                with _progress_bar(rig):
                     check(rig)
                     rig.finish()
         finally:

@@ -57,7 +57,7 @@ class ComparedPalpation(NamedTuple):
     faults: tuple[str, ...] = ()
     """Faults of the recording, for messages."""
 
-    def moved(self, X: Array) -> ComparedPalpation:
+    def in_frame(self, X: Array) -> ComparedPalpation:
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
         return self._replace(map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
 
@@ -137,7 +137,7 @@ def compare(a: ComparedPalpation, b: ComparedPalpation, register: bool | None = 
     wanted = _apart(a, b) > TUNING.near_m if register is None else register
     if wanted:
         X = _registration(a, b)
-    moved = b.moved(X)
+    moved = b.in_frame(X)
     xy = moved.places[:, :2]
     of_a, lower, upper = (_on(a, values)(xy) for values in (a.map.apparent, a.map.lower, a.map.upper))
     of_b = _on(moved, b.map.apparent)(xy)

@@ -159,10 +159,10 @@ def _round_trips() -> Iterator[FuzzTarget]:
     options = [
         b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k",
     ]  # fmt: skip
-    yield _round_trip("options", _options, _written, BusConfigError, options)
+    yield _round_trip("options", _options, _encode_options, BusConfigError, options)
 
 
-def _written(options: BusOptions) -> bytes:
+def _encode_options(options: BusOptions) -> bytes:
     environment = options.to_env()
     return _bytes("\n".join(environment.get(name, "") for name in _VARIABLES))
 

@@ -276,7 +276,7 @@ class _TaredSensor:
         now = self._begin + k
         self._tare = float(np.mean(self._normal[max(now - round(TOUCH.tare_s / PERIOD_S), 0) : now]))
 
-    def tared(self, k: int) -> float:
+    def tared_reading(self, k: int) -> float:
         """Return the reading in the k-th period without a force, along the outward normal [N]."""
         self._read(self._begin + k)
         return self._normal[self._begin + k] - self._tare

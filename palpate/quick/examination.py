@@ -249,7 +249,7 @@ class QuickExamination:
         depth = self._depth - path.error_m[at] - self._zero_m - loop.wander.at(k) + unseen
         height = patient.radius - depth + share * excursion
         force = patient.move(path.place[at] + height * path.normal[at])
-        self._force = loop.sensor.lagging(float(path.gains[at] @ force)) + loop.sensor.tared(k)
+        self._force = loop.sensor.lagging(float(path.gains[at] @ force)) + loop.sensor.tared_reading(k)
         along = float(path.normal[at] @ force)
         self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
         self._touching = self._force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)

@@ -179,11 +179,11 @@ class Patient:
         PluginError if a tissue of a user's file wants to end the program.
         """
         try:
-            return self._moved(p)
+            return self._pressed_force(p)
         except SystemExit as left:
             raise kind("tissue").failure(self.scenario.services.tissue, left) from left
 
-    def _moved(self, p: Array) -> Array:
+    def _pressed_force(self, p: Array) -> Array:
         self._tick()
         if self._motion.moves and self.time > self._motion.at_s:
             X = inverse(self._motion.pose(self.time))

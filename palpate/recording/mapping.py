@@ -49,7 +49,7 @@ class MappedColumns(Section):
     """Position of the tool at first contact of the probe."""
 
     @model_validator(mode="after")
-    def _ordered(self) -> MappedColumns:
+    def _check_order(self) -> MappedColumns:
         if (self.time is None) == (self.probe is None):
             raise ValueError("want one of time and probe")
         return self

@@ -59,7 +59,7 @@ class PlaceProcess:
         """Inverse of the covariance times the values, shape (n,)."""
         return np.asarray(cho_solve((self.cholesky, True), self.values))
 
-    def fitted(self, bounds: Sequence[tuple[float, float]]) -> PlaceProcess:
+    def fit(self, bounds: Sequence[tuple[float, float]]) -> PlaceProcess:
         """Return the process with the most probable parameters within `bounds` of variance, length and further noise."""
 
         def misfit(parameters: Array) -> float:

@@ -355,7 +355,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LIMITS.rows}")
     faults += _implausible(readings)
     if is_refused(faults):
-        return _refused(name, mapping, faults)
+        return _without_contacts(name, mapping, faults)
     parts = probes(readings) if readings.time is None else blocks(readings.time)
     if readings.normal is not None and _inward(readings, parts):
         faults.append(Fault(FaultCode.NORMALS, 1, 1, Remedy.CORRECTED))
@@ -367,7 +367,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
             f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
         )
     if axis.angle_deg > LIMITS.wrong_frame_deg:
-        return _refused(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
+        return _without_contacts(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
     if axis.angle_deg > LIMITS.doubtful_frame_deg:
         faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.KEPT, axis.angle_deg))
     if axis.flipped:
@@ -402,7 +402,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     )
 
 
-def _refused(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecording:
+def _without_contacts(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecording:
     return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
 
 

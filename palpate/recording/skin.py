@@ -102,7 +102,7 @@ def fit_skin(points: Array, sd: Array, stations: tuple[Array, Array], shortest: 
     begin = np.log((1.0, max(shortest, 0.5 * extent), 0.05))
     process = PlaceProcess(points[:, :2], rest / size, (sd / size) ** 2, begin)
     with threadpool_limits(1):
-        process = process.fitted(((0.05, 1e3), (shortest, 10 * extent), (1e-4, 1.0)))
+        process = process.fit(((0.05, 1e3), (shortest, 10 * extent), (1e-4, 1.0)))
         for _ in range(_OUTLIERS):
             precision = np.diag(cho_solve((process.cholesky, True), np.eye(len(points))))
             off = process.weights / precision  # of each point from the skin through the others

@@ -58,7 +58,7 @@ def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: A
     if mapping.body.surface is not None:
         scale = SCALES[mapping.units.length]
         work.skin = of_mesh(mapping.body.surface, scale, inverse(X_WA), mapping.tool.radius_m, work.stations)
-    return work.palpated(faults)
+    return work.palpation(faults)
 
 
 def _prepare(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fault]) -> tuple[Readings, float]:
@@ -138,14 +138,14 @@ class _Measured:
         self.skin: RecordedSkin | None = None
         self.power = 1.0
 
-    def palpated(self, faults: list[Fault]) -> Palpated:
+    def palpation(self, faults: list[Fault]) -> Palpated:
         """Return the contacts and the skin; adds a fault."""
         given = self.skin is not None
         for _ in range(2):  # the second time with the normals of the first
             loads = [self._loading(*one) for one in self.touching]
             self.power = cutting.power_of([load.loaded for load in loads], self.sigma)
             onsets = [cutting.onset(load.loaded, self.power, self.sigma) for load in loads]
-            kept = self._kept(loads, onsets)
+            kept = self._slide_depths(loads, onsets)
             points, sd = self._skin_points(loads, onsets, kept)
             if not len(points):
                 return Palpated.nothing()._replace(untold=len(self.touching))
@@ -170,11 +170,11 @@ class _Measured:
             if motion is _Motion.SLIDE:
                 contacts += self._slid(one, kept.get(k))
             elif begin is not None and self.readings.whole[one].any():
-                contacts.append(self._pressed(one, load, begin))
+                contacts.append(self._contact(one, load, begin))
         centres, normals = self.skin.points()
         return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
 
-    def _kept(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> dict[int, float]:
+    def _slide_depths(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> dict[int, float]:
         """Return the depth that each slide is taken to keep [m]: as it began, or the usual one if that is unlike it."""
         slides = [k for k, (_, motion) in enumerate(self.touching) if motion is _Motion.SLIDE]
         begun = {k: loads[k].at_inward - begin.at if (begin := onsets[k]) else 0.0 for k in slides}
@@ -228,7 +228,7 @@ class _Measured:
         moving &= self.readings.whole[one]
         return p[moving], self.readings.force[one][moving], self._time(one)[moving]
 
-    def _pressed(self, one: slice, load: _Loading, begin: ContactOnset) -> Contact:
+    def _contact(self, one: slice, load: _Loading, begin: ContactOnset) -> Contact:
         p = self.readings.position[one]
         cycle = load.along is not None
         kept = slice(None) if cycle else cutting.before_lift(-(p @ load.normal))

@@ -57,7 +57,7 @@ class Player:
         self._rate = rate
         self._drive = drive
         self._looked = 0
-        self.topics = _chosen(recording, contract(), topics)
+        self.topics = _choose_topics(recording, contract(), topics)
         recording.check(contract(), self.topics, whole=False)
         self.origin = recording.origin(self.topics)
         """Stamp [ns] from which the times of `play` count."""
@@ -164,7 +164,7 @@ class Player:
         close_session(self._session)
 
 
-def _chosen(recording: Recording, contract: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
+def _choose_topics(recording: Recording, contract: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
     for name in topics or ():
         if name.strip("/") not in recording.types:
             raise UserError(f"--topic {name}: {recording.path} has {', '.join(sorted(recording.types))}")

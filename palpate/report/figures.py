@@ -140,7 +140,7 @@ class Drawing:
             look: Any = {"color": "white", "weight": "bold", "path_effects": [withStroke(linewidth=2, foreground=INK)]}
             axes.text(0.03 + 0.94 * x, 0.03 + 0.94 * y, name, fontsize=10, **place, **look)
 
-    def rounded(self, member: Array) -> Array:
+    def smooth(self, member: Array) -> Array:
         """Return membership averaged over neighbours, so that its half level is a smooth outline."""
         edges = np.concatenate((self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]))
         for _ in range(3):
@@ -157,7 +157,7 @@ class Drawing:
             member = (self.map.finding == i).astype(float)
             if not member.any():
                 continue
-            contour = axes.tricontour(self.tri, self.rounded(member), levels=[0.5], colors=[_FINDING], linewidths=2.0)
+            contour = axes.tricontour(self.tri, self.smooth(member), levels=[0.5], colors=[_FINDING], linewidths=2.0)
             contour.set_path_effects([withStroke(linewidth=3.6, foreground=INK)])
             x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
             axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=INK)])
@@ -175,7 +175,7 @@ class Drawing:
                 )
         if truth and self.lump is not None and self.lump.max() > 0.5:
             contour = axes.tricontour(
-                self.tri, self.rounded(self.lump), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
+                self.tri, self.smooth(self.lump), levels=[0.5], colors=[_TRUE], linewidths=1.6, linestyles="--"
             )
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 

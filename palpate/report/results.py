@@ -52,14 +52,14 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     contact = np.concatenate(runs).view(np.recarray)
     touched = Touched(contact.believed, contact.touched)
     try:
-        pressed = _pressed(scenario)
+        pressed = _press_patient(scenario)
     except Exception:  # a user-defined tissue that was changed during the run, or that can be created only once
         log.exception("palpable truth unknown: the patient cannot be pressed")
         pressed = None
     return Known(body, contact, None if pressed is None else evidence.felt_truth(scenario, body, pressed, touched))
 
 
-def _pressed(scenario: Scenario) -> Pressed | None:
+def _press_patient(scenario: Scenario) -> Pressed | None:
     tissue = scenario.services.tissue
     if not implementations.kind("tissue").foreign(tissue):
         return press_patient(scenario)

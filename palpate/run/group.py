@@ -83,7 +83,7 @@ def group_command(file: Path, words: Mapping[str, Sequence[str]], own: Mapping[s
     return ("python", "-m", "palpate.run.group", str(file))
 
 
-def _hosted(role: str, words: Sequence[str], environment: Mapping[str, str]) -> Hosted:
+def _host(role: str, words: Sequence[str], environment: Mapping[str, str]) -> Hosted:
     def make() -> Service:
         with set_environment(environment):
             return load_service(role, load_scenario, words)
@@ -95,7 +95,7 @@ def _hosted(role: str, words: Sequence[str], environment: Mapping[str, str]) -> 
 def main(arguments: Sequence[str]) -> None:
     """Run the group to its end, and exit with status 0, or 3 if the run failed or was aborted."""
     hosted = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
-    host(lambda: [_hosted(role, *row) for role, row in hosted.items()], "+".join(hosted))
+    host(lambda: [_host(role, *row) for role, row in hosted.items()], "+".join(hosted))
 
 
 if __name__ == "__main__":

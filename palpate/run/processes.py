@@ -245,7 +245,7 @@ class LocalProcesses:
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """Return the environment of a service beyond that of this process."""
         files = {"scenario": self._scenario_files[process.role], "out": self._out if process.role in OBSERVERS else None}
-        settings = Settings.read({**os.environ, **process.environment}).replaced(**files, **self._given)
+        settings = Settings.read({**os.environ, **process.environment}).replace(**files, **self._given)
         return {**process.environment, **FIXED, **settings.to_env(), **self.bus[process.role].to_env()}
 
     def as_conductor(self) -> AbstractContextManager[None]:
@@ -261,7 +261,7 @@ class LocalProcesses:
         command, given = (processes[0].command, self.environment(processes[0])) if alone else self._group(processes)
         path = self._out / "logs" / f"{'+'.join(roles)}.log"
         self._log_files |= dict.fromkeys(roles, path)
-        self.running |= dict.fromkeys(roles, self._started(command, {**os.environ, **given}, path))
+        self.running |= dict.fromkeys(roles, self._start(command, {**os.environ, **given}, path))
 
     def _group(self, processes: Sequence[ServiceProcess]) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return command and common environment of services in one process. The group's file has the rest of each environment."""
@@ -271,7 +271,7 @@ class LocalProcesses:
         words = {process.role: process.shared_words() for process in processes}
         return group_command(self.folder / f"{processes[0].role}.json", words, own), common
 
-    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> subprocess.Popen[bytes]:
+    def _start(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> subprocess.Popen[bytes]:
         log = path.open("wb")
         self._logs.append(log)
         return subprocess.Popen(
@@ -298,10 +298,10 @@ class LocalProcesses:
         """
         steps: tuple[signal.Signals | None, ...] = (None, signal.SIGTERM, signal.SIGKILL)
         try:
-            for child in self._left():
+            for child in self._remaining():
                 child.send_signal(signal.SIGCONT)
             for send in steps[-1:] if at_once else steps:
-                left = self._left()
+                left = self._remaining()
                 deadline = monotonic() + patience_s
                 for child in left:
                     if send is not None:
@@ -310,13 +310,13 @@ class LocalProcesses:
                     with suppress(subprocess.TimeoutExpired):
                         child.wait(timeout=max(0.0, deadline - monotonic()))
         finally:  # after Ctrl-C, too
-            for child in self._left():
+            for child in self._remaining():
                 child.send_signal(signal.SIGKILL)
             for log in self._logs:
                 log.close()
             self._announcement.withdraw()
             self._own.remove()
 
-    def _left(self) -> list[subprocess.Popen[bytes]]:
+    def _remaining(self) -> list[subprocess.Popen[bytes]]:
         """Return the processes that have not ended."""
         return [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]

@@ -165,7 +165,7 @@ class RunDisplay:
             return
         if not self.begun and not self._keys.attached and self._keys.__enter__().attached:
             self._console.print(HINT, style="dim", highlight=False)
-        for word in self._keys.pressed():
+        for word in self._keys.read_requests():
             progress.request(WORDS[word], "a key of palpate run")
             self._console.print(f"{word}: passed on", highlight=False)
         supervisor = progress.collected.supervisor

@@ -80,7 +80,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         patient = (options or {}).get("patient", int(self.np_random.integers(self._patients)))
         self._begin(_cases(patient))
-        return self._observed(), {"patient": patient}
+        return self._observation(), {"patient": patient}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Press once; return observation, reward, terminated, truncated, info."""
@@ -98,7 +98,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if over:
             reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.minimum)
         info = {"lump": self.posterior.lump, "truth": self._truth()} if over else {}
-        return self._observed(), float(reward), over, False, info
+        return self._observation(), float(reward), over, False, info
 
     def _begin(self, patient: SearchCase) -> None:
         hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
@@ -130,7 +130,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= REWARD.near_m
         return float(self.posterior.by_place[near].sum())
 
-    def _observed(self) -> Observation:
+    def _observation(self) -> Observation:
         left = np.array([1 - self._count / self._presses], dtype=np.float32)
         seen: Observation = {"history": self._history.clip(-10, 10), "left": left}
         if self._maps:

@@ -110,7 +110,7 @@ class PatientHand(_Timed):
             unseen = (1.0 - loop.followed) * share * (excursion - self._mean)
             true = measured - wrong - loop.wander.at(self._period) + unseen
             felt = patient.move(place + (patient.radius - true + share * excursion) * normal)
-            force = float(gain @ felt) + loop.sensor.tared(self._period)
+            force = float(gain @ felt) + loop.sensor.tared_reading(self._period)
             if at_depth:
                 depths.append(measured)
                 forces.append(force)

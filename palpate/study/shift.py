@@ -273,7 +273,7 @@ _LEVER_M: Final = 0.15
 """From the flange to the indenter, about."""
 
 
-def _chosen(**values: Any) -> Callable[..., Settings]:
+def _error_change(**values: Any) -> Callable[..., Settings]:
     def change(_: Phantom, __: Anatomy, ___: Rng) -> Settings:
         return {f"errors.chosen.{name}": value for name, value in values.items()}
 
@@ -325,9 +325,9 @@ FAMILIES: Final[Mapping[Family, Mapping[str, Callable[..., Settings]]]] = {
     },
     Family.VARIATION: {"short": _varying((0.010, 0.016), (0.006, 0.010)), "long": _varying((0.12, 0.35), (0.15, 0.40))},
     Family.EQUIPMENT: {
-        "gain-high": _chosen(force_gain=_GAIN),
-        "gain-low": _chosen(force_gain=-_GAIN),
-        "lag": _chosen(force_lag_s=0.040),
+        "gain-high": _error_change(force_gain=_GAIN),
+        "gain-low": _error_change(force_gain=-_GAIN),
+        "lag": _error_change(force_lag_s=0.040),
         "askew": _askew,
     },
 }

@@ -93,7 +93,7 @@ class FittedPress(NamedTuple):
 def presses_of(recording: PalpationRecording) -> list[FittedPress]:
     """Return the presses of a recording, thinned evenly to `TUNING.max_presses`. Raises UserError if there are too few."""
     slides = {n for n, touch in enumerate(recording.touches, start=1) if touch.kind is ContactKind.SLIDE}
-    presses = [_pressed(touch) for touch in recording.touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0]
+    presses = [_fit_press(touch) for touch in recording.touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0]
     if slides:
         radius = recording.indenter_radius_m
         presses += [_slid(sample, radius) for sample in recording.samples() if sample.stroke in slides and sample.depth > 0]
@@ -104,7 +104,7 @@ def presses_of(recording: PalpationRecording) -> list[FittedPress]:
     return [presses[k] for k in chosen]
 
 
-def _pressed(touch: Contact) -> FittedPress:
+def _fit_press(touch: Contact) -> FittedPress:
     until = int(np.flatnonzero(touch.depth >= 0.95 * touch.depth.max())[-1]) + 1  # without the retreat
     chosen = np.unique(np.linspace(0, until - 1, TUNING.readings).round().astype(int))
     chosen = chosen[touch.depth[chosen] > 0]
@@ -212,7 +212,7 @@ class _Field:
         rest = values - self._level
         if self._process is None:  # its lengths are those of the first observations
             begin = PlaceProcess(self._places / self._scale, rest, np.zeros(len(rest)), np.log((0.05, 3.0, 0.01)), matern)
-            self._process = begin.fitted(((1e-5, 1e5), (1.0, 100.0), (1e-5, 1.0)))
+            self._process = begin.fit(((1e-5, 1e5), (1.0, 100.0), (1e-5, 1.0)))
         else:
             self._process = replace(self._process, values=rest)
 

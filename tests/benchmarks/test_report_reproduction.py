@@ -17,7 +17,7 @@ from palpate.truth.pressed import Touched
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
-from palpate_reproduction.page import chosen_moments
+from palpate_reproduction.page import choose_moments
 from palpate_reproduction.scene import Body, Viewpoint, draw
 
 
@@ -58,7 +58,7 @@ def evidence(phase: list[int], force: list[float]) -> Evidence:
 
 def test_the_moments_are_of_their_phases() -> None:
     one = evidence([0, 1, 1, 3, 3, 4, 4, 5, 5, 5, 5, 6, 7], [0, 0, 0, 0, 0, 1, 2, 2, 2, 9, 2, 1, 0])
-    chosen = {words: time for words, time, _ in chosen_moments(one)}
+    chosen = {words: time for words, time, _ in choose_moments(one)}
     assert 1 <= chosen["camera burst"] <= 2
     assert 3 <= chosen["approaching"] <= 4
     assert 5 <= chosen["descending"] <= 6

@@ -72,8 +72,8 @@ def test_a_tare_takes_the_bias_away() -> None:
     chosen = scenario(2, settings=SMALL)
     loop = Loop(chosen, loop_errors(chosen))
     loop.sensor.tare(100)
-    assert abs(np.mean([loop.sensor.tared(k) for k in range(75, 100)])) < 1e-9
-    assert 0.0 < np.std([loop.sensor.tared(k) for k in range(100, 400)]) < 0.2
+    assert abs(np.mean([loop.sensor.tared_reading(k) for k in range(75, 100)])) < 1e-9
+    assert 0.0 < np.std([loop.sensor.tared_reading(k) for k in range(100, 400)]) < 0.2
 
 
 @pytest.mark.parametrize(("name", "time"), [("regulation_m", "regulation_s"), ("wander_m", "wander_s")])

@@ -49,7 +49,7 @@ def test_same_body_agrees_within_its_band(tmp_path: Path) -> None:
 
 def test_moved_body_is_registered() -> None:
     X = matrix(Pose(xyz_m=(0.02, -0.01, 0.3), rpy_rad=(0.05, -0.03, 0.2)))
-    a, b = _palpated("a", 1.0, 0.02, 0), _palpated("b", 1.0, 0.0, 1).moved(X)
+    a, b = _palpated("a", 1.0, 0.02, 0), _palpated("b", 1.0, 0.0, 1).in_frame(X)
     found = compare(a, b).figures
     assert found.registered
     apart = np.array(found.X_AB) @ X - np.eye(4)
@@ -63,7 +63,7 @@ def test_moved_body_is_registered() -> None:
 def test_bodies_without_common_places_are_refused() -> None:
     a, b = _palpated("a", 1.0, 0.02, 0), _palpated("b", 1.0, 0.0, 1)
     with pytest.raises(UserError, match="0 places"):
-        compare(a, b.moved(matrix(Pose(xyz_m=(0.5, 0.0, 0.0)))), register=False)
+        compare(a, b.in_frame(matrix(Pose(xyz_m=(0.5, 0.0, 0.0)))), register=False)
 
 
 def test_simulation_narrows_the_interval_of_outcomes(tmp_path: Path) -> None:

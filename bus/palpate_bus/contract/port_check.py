@@ -6,7 +6,7 @@ service sends, and where it receives (in lockstep when the service first reads t
 lockstep a refused message ends the run. In wall-clock mode it is dropped and reported, so readers act as on silence. No service
 needs a check of its own.
 
-Each rule is written twice: `_Source` generates the fast test; `Checker` and `broken_past` run after it has refused a message, to
+Each rule is written twice: `_Source` generates the fast test; `Checker` and `check_order` run after it has refused a message, to
 name the violation.
 
 `Checker` names what is wrong with a message by itself; `violations` does the same as text. A value that is out of range but
@@ -95,7 +95,7 @@ def turn(now: Message, before: Message) -> float:
     return 2 * acos(min(cosine, 1.0))
 
 
-def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> Iterator[MessageViolation]:
+def check_order(topic: Topic, past: PastMessages, message: Message, t: int) -> Iterator[MessageViolation]:
     """Yield how a message that is sent or received at `t` [ns] breaks the contract after those before it."""
     stamp, age = nanoseconds(message.header.stamp), topic.max_age_ms or inf
     got = f"{stamp / 1e6:g} ms at {t / 1e6:g} ms"
@@ -167,7 +167,7 @@ class PortCheck:
     def _violation(self, message: Message, t: int) -> MessageViolation:
         try:
             alone = Checker(self._topic)(message)
-            return alone[0] if alone else next(broken_past(self._topic, self._past, message, t))
+            return alone[0] if alone else next(check_order(self._topic, self._past, message, t))
         except Exception as error:  # a field has a value of another type
             return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error) or "a field of another type")
 

@@ -106,7 +106,7 @@ class OperatorKeys:
                 termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
             self._before = []
 
-    def pressed(self) -> list[str]:
+    def read_requests(self) -> list[str]:
         """Return the requests of the keys pressed since the last call."""
         words = []
         while self._before and select([self._fd], [], [], 0)[0]:

@@ -194,11 +194,11 @@ class Reports:
         message = ServiceReport(state, self._member.role, tick, waiting_for, text)
         self._publisher.put(self._encode(message), self._sequence)
 
-    def conductor_lost(self, tick: int, reason: str) -> None:
+    def report_conductor_lost(self, tick: int, reason: str) -> None:
         """Report that the conductor is lost, for the case that it returns."""
         self.send(ServiceReport.PROGRESS, tick, CONDUCTOR, {"conductor_lost": reason})
 
-    def aborted(self, tick: int, reason: str) -> None:
+    def report_abort(self, tick: int, reason: str) -> None:
         """Report that the service leaves on an ABORT message, so that the conductor detects a forged one."""
         self.send(ServiceReport.PROGRESS, tick, "", {"ended_by": reason})
 

@@ -140,7 +140,7 @@ class RemoteInputs:
         self._data: dict[str, Subscription] = {}
         for name, buffer in stepper.buffers.items():
             if buffer.topic.producer in local and not buffer.topic.open:
-                member.observed(buffer.topic)
+                member.declare_observed(buffer.topic)
             else:
                 self._data[name] = member.subscription(buffer.topic)
         remote = [stepper.buffers[name] for name in self._data]
@@ -200,7 +200,7 @@ class RemoteInputs:
                 self._receive_advance(buffer.topic.producer, sample)
         if waited and sample is not None:
             duration = perf_counter_ns() - begin
-            self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
+            self._stepper.blame.count_wait(buffer.topic.producer, duration, self._now() - sample.sent)
 
     def _accept_or_blame_sender(self, buffer: InputBuffer, sample: ReceivedSample) -> None:
         """Give the buffer a message. If its number is wrong, check if two senders share an identity."""

@@ -33,9 +33,9 @@ class Group:
         }
         for port, readers in self._readers.items():
             port.passed = codec.passer(port.topic.type) if readers else None
-        self._schedule = self._scheduled(frozenset())
+        self._schedule = self._schedule_cycle(frozenset())
 
-    def _scheduled(self, without: frozenset[str]) -> tuple[tuple[Stepper, ...], ...]:
+    def _schedule_cycle(self, without: frozenset[str]) -> tuple[tuple[Stepper, ...], ...]:
         """Return the services that step at each tick of one cycle, which repeats."""
         steppers = [stepper for role, stepper in self.steppers.items() if role not in without]
         ticks = range(0, lcm(*(stepper.role.period for stepper in steppers)), self.period)
@@ -47,7 +47,7 @@ class Group:
 
     def leave_out(self, roles: frozenset[str]) -> None:
         """Stop stepping the services of `roles`."""
-        self._schedule = self._scheduled(roles)
+        self._schedule = self._schedule_cycle(roles)
 
     def deliver(self, sent: Sequence[Outgoing]) -> None:
         """Deliver messages to their readers in the group."""

@@ -39,7 +39,7 @@ class Blame:
     waited_for: dict[str, int] = field(default_factory=dict)
     """Waiting time [ns] by the role whose message ended the wait."""
 
-    def waited(self, role: str, duration: int, transport: int) -> None:
+    def count_wait(self, role: str, duration: int, transport: int) -> None:
         """Count one wait [ns] that ended with a message of `role`, whose transit took `transport` [ns]."""
         transport = min(max(transport, 0), duration)
         self.transport += transport

@@ -54,7 +54,7 @@ class Member:
         decode = codec.decoder(topic.type) if topic.open else None
         return self._keep(topic.name, self.transport.subscription(topic_key(topic, self.domain), history, decode))
 
-    def observed(self, topic: Topic) -> str:
+    def declare_observed(self, topic: Topic) -> str:
         """Declare a subscription that the caller makes; return its key."""
         self._tokens.subscription(topic, self.contract.qos[topic.qos])
         return topic_key(topic, self.domain)

@@ -86,9 +86,9 @@ class Node(ABC):
                 with suppress(Exception):
                     seat.output.flush(seat.tick)  # the recording needs every message that was sent
                 if self._link.lost:
-                    seat.reports.conductor_lost(seat.tick, self._link.lost)
+                    seat.reports.report_conductor_lost(seat.tick, self._link.lost)
                 elif self._link.ended_by:
-                    seat.reports.aborted(seat.tick, self._link.ended_by)
+                    seat.reports.report_abort(seat.tick, self._link.ended_by)
                 with suppress(Exception):
                     seat.close()
             raise

@@ -50,7 +50,7 @@ class _Feed:
 
     def __init__(self, member: Member, topic: Topic, lossless: bool) -> None:
         self.topic = topic
-        key = member.observed(topic)
+        key = member.declare_observed(topic)
         channel: Any = zenoh.handlers.FifoChannel(LIMITS.fifo) if lossless else zenoh.handlers.RingChannel(LIMITS.ring)
         self._subscriber = subscribe(member.session, key, channel, history=topic.latched)
         self._try = self._subscriber.handler.try_recv
@@ -161,7 +161,7 @@ class ObserverNode:
         """Process received messages; return True if there were any."""
         return self._feeds.drain_and_step()
 
-    def _reached(self) -> int:
+    def _reached_tick(self) -> int:
         """Return the tick [ns] up to which everything was received."""
         return self._feeds.now
 
@@ -177,7 +177,7 @@ class ObserverNode:
 
     def _report(self) -> None:
         """Report progress."""
-        self._reports.progress(self._reached())
+        self._reports.progress(self._reached_tick())
 
     def _obey(self, message: Any) -> None:
         """Process a control message other than HELLO and END."""
@@ -220,7 +220,7 @@ class ObserverNode:
                 self._service.finish()  # received data is kept
             raise
         facts = dict(self._service.finish())
-        self._reports.send(ServiceReport.FINISHED, self._reached(), detail={"facts": facts, **self._details()})
+        self._reports.send(ServiceReport.FINISHED, self._reached_tick(), detail={"facts": facts, **self._details()})
 
     def _drain_rest(self) -> None:
         """Receive what is in transit: the conductor's message may overtake messages that others sent before it."""
@@ -272,7 +272,7 @@ class RecorderNode(ObserverNode):
         self._lost: set[str] = set()
         self._reported_trouble = ""
 
-    def _reached(self) -> int:
+    def _reached_tick(self) -> int:
         """Return the tick [ns] up to which the messages of every producer that is not lost are written."""
         return min((tick for role, tick in self._covered.items() if role not in self._lost), default=NEVER)
 
@@ -293,7 +293,7 @@ class RecorderNode(ObserverNode):
         """Report progress, and once, without delay, that recording stopped."""
         if self._recorder.trouble != self._reported_trouble:
             self._reported_trouble = self._recorder.trouble
-            self._reports.send(ServiceReport.PROGRESS, self._reached(), detail={"suspicions": [self._reported_trouble]})
+            self._reports.send(ServiceReport.PROGRESS, self._reached_tick(), detail={"suspicions": [self._reported_trouble]})
         super()._report()
 
     def _drain(self) -> bool:

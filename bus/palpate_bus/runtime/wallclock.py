@@ -142,7 +142,7 @@ class WallClockNode(Node):
         catch_up = TIMES.catch_up_ns if self._stepper.role.critical and self._seat.service.catches_up else period
         t = self._await_inputs()
         while self._end is None or t <= self._end:
-            late = self._passed() - t
+            late = self._run_time() - t
             if late < 0:
                 sleep(-late / self._rate / 1e9)
             elif late > period:
@@ -170,9 +170,9 @@ class WallClockNode(Node):
         lost = self._stepper.inbox.lost_roles
         if self._link.lost and CONDUCTOR not in lost:
             lost.add(CONDUCTOR)
-            self._seat.reports.conductor_lost(self._seat.tick, self._link.lost)
+            self._seat.reports.report_conductor_lost(self._seat.tick, self._link.lost)
 
-    def _passed(self) -> int:
+    def _run_time(self) -> int:
         """Return the time of the run [ns]: wall time since the common start, times the rate."""
         passed = monotonic_ns() - self._epoch
         return passed if self._rate == 1.0 else int(passed * self._rate)
@@ -193,7 +193,7 @@ class WallClockNode(Node):
                 self._obey(message)
             self._receive(0)
         period = self._stepper.role.period
-        return max(0, self._passed() // period * period)
+        return max(0, self._run_time() // period * period)
 
     def _receive(self, t: int) -> None:
         now = self._now()

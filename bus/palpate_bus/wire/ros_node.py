@@ -49,7 +49,7 @@ class RosSubscription:
         self.garbage = 0
         """Messages that could not be decoded."""
 
-    def received(self) -> list[tuple[bytes, Any]]:
+    def receive(self) -> list[tuple[bytes, Any]]:
         """Return new messages with the GID of their publisher, oldest first; at most `RING`."""
         pairs = []
         while (sample := self._try()) is not None:
@@ -63,11 +63,11 @@ class RosSubscription:
 
     def take(self) -> list[Any]:
         """Return the messages of `received`."""
-        return [message for _, message in self.received()]
+        return [message for _, message in self.receive()]
 
     def others(self, own: bytes) -> list[bytes]:
         """Return the publishers' GIDs of `received`, without `own`."""
-        return [sender for sender, _ in self.received() if sender != own]
+        return [sender for sender, _ in self.receive() if sender != own]
 
     def newest(self) -> Any | None:
         """Return the newest message since the last call, or None."""

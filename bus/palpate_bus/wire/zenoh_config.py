@@ -120,13 +120,13 @@ class BusOptions:
         return cls(**given, drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wallclock else LOCKSTEP_DROP_WAIT_US)
 
     def settings(self) -> dict[str, Any]:
-        """Return these options as fields for `Settings.replaced`, without `drop_wait_us`, which follows from the runtime."""
+        """Return these options as fields for `Settings.replace`, without `drop_wait_us`, which follows from the runtime."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "drop_wait_us"}
 
     def to_env(self) -> dict[str, str]:
         """Return the environment variables for another process with these options; empty ones override inherited ones."""
         own = self.settings()
-        environment = Settings.read({}).replaced(**own).to_env()
+        environment = Settings.read({}).replace(**own).to_env()
         return {variable(name): environment[variable(name)] for name in own}
 
 

@@ -109,7 +109,7 @@ class NaturalField:
         self._parts = [_component(rng, length_m, float(share), reference) for share in shares]
         total = self._sum(reference)
         self._middle, self._reach = float(total.mean()), VARIATION.max_sd * float(total.std())
-        bounded = self._bounded(reference)
+        bounded = self._bound(reference)
         self._mean, self._sd = float(bounded.mean()), float(bounded.std())
 
     def _sum(self, points: Array) -> Array:
@@ -118,12 +118,12 @@ class NaturalField:
             total += part.weight * (part(points) - part.mean) / part.sd
         return total
 
-    def _bounded(self, points: Array) -> Array:
+    def _bound(self, points: Array) -> Array:
         return np.tanh((self._sum(points) - self._middle) / self._reach)
 
     def __call__(self, points: Array) -> Array:
         """Return the field at points (n, 3) of A [m], shape (n,)."""
-        return np.asarray((self._bounded(points) - self._mean) / self._sd)
+        return np.asarray((self._bound(points) - self._mean) / self._sd)
 
 
 class HealthyWall(NamedTuple):

@@ -69,7 +69,7 @@ def median_force(depth_m: Array) -> Array:
     return np.median([curves()[place].force(depth_m) for place in relaxed_people()], axis=0)
 
 
-def activated(region: str) -> str:
+def activated_region(region: str) -> str:
     """Return the region of the same place with tensed muscles: "A3" for "R3"."""
     return region.replace("R", "A")
 

@@ -47,7 +47,7 @@ def slope(u: Array, stiffening: Array) -> Array:
     return np.minimum((stiffening * np.maximum(u, 0.0)) ** 2, MOST_STIFFENING)
 
 
-def stored(u: Array, stiffening: Array) -> Array:
+def stored_energy(u: Array, stiffening: Array) -> Array:
     """Its energy over k_w and area [m^2]: the integral of `stress`."""
     pressed = np.maximum(u, 0.0)
     bent = np.minimum(pressed, straight_from(stiffening))

@@ -35,7 +35,7 @@ class Box(NamedTuple):
     """Full edge lengths along B's axes [m]."""
 
 
-def _aligned(name: str, low: Vec3, high: Vec3) -> Box:
+def _aligned_box(name: str, low: Vec3, high: Vec3) -> Box:
     X_WB = rigid(np.eye(3), (np.array(low) + np.array(high)) / 2)
     return Box(name, X_WB, (high[0] - low[0], high[1] - low[1], high[2] - low[2]))
 
@@ -47,8 +47,8 @@ def boxes(robot: Robot) -> tuple[Box, ...]:
     height = robot.base_height_m
     base = Pose(xyz_m=(*robot.base_xy_m, height / 2), rpy_rad=(0.0, 0.0, robot.base_yaw_rad))
     return (
-        _aligned("table_top", (TABLE.x_m[0], TABLE.y_m[0], under), (TABLE.x_m[1], TABLE.y_m[1], TABLE.top_m)),
-        _aligned(
+        _aligned_box("table_top", (TABLE.x_m[0], TABLE.y_m[0], under), (TABLE.x_m[1], TABLE.y_m[1], TABLE.top_m)),
+        _aligned_box(
             "table_column",
             (x - TABLE.column_m[0] / 2, y - TABLE.column_m[1] / 2, 0.0),
             (x + TABLE.column_m[0] / 2, y + TABLE.column_m[1] / 2, under),

@@ -198,7 +198,7 @@ class _Reader(UrdfTree):
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
         chain = self.chain(self._given.flange)
         self._base = chain[0]
-        poses, moving = self._placed(chain)
+        poses, moving = self._link_poses(chain)
         n = len(moving)
         if n not in (6, 7):
             return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]
@@ -259,7 +259,7 @@ class _Reader(UrdfTree):
             raise ValueError(f"{self.part}: its axis is zero")
         return axis / np.linalg.norm(axis)
 
-    def _placed(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
+    def _link_poses(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
         """Return the pose of each link in the root at zero, and the joints that turn."""
         X, poses, moving = np.eye(4), [np.eye(4)], []
         for link in chain[1:]:

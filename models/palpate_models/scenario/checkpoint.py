@@ -58,7 +58,7 @@ class Checkpoint:
     strokes: int
     """Number of descents."""
 
-    def wanted(self, targets: Array, spacing: float) -> frozenset[int]:
+    def remaining_targets(self, targets: Array, spacing: float) -> frozenset[int]:
         """Return the indices of new targets, in A [m], shape (j, 2), within half a `spacing` [m] of a remaining one."""
         away = np.linalg.norm(targets[:, None] - self.left, axis=-1)
         return frozenset(np.flatnonzero((away < spacing / 2).any(axis=1)).tolist())

@@ -182,7 +182,7 @@ class Errors(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _levelled(cls, given: Any) -> Any:
+    def _expand_level(cls, given: Any) -> Any:
         """Expand a level's name to a mapping, and fill unset fields from the level."""
         if isinstance(given, str):
             given = {"level": given}

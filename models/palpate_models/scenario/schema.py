@@ -329,7 +329,7 @@ class Scenario(Section):
 
     @field_validator("phantom")
     @classmethod
-    def _drawn(cls, phantom: Phantom, info: ValidationInfo) -> Phantom:
+    def _draw_person(cls, phantom: Phantom, info: ValidationInfo) -> Phantom:
         """Draw a person from the seed, so that every scenario has a complete phantom."""
         seed = info.data.get("seed")
         return phantom if seed is None else draw_person(phantom, seed)

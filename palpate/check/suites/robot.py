@@ -90,7 +90,7 @@ def suite(rig: Rig) -> None:
     _force(rig)
     _twist(rig)
     rig.section("safe hold")
-    _lost(rig)
+    _check_loss(rig)
     _limits(rig)
 
 
@@ -265,7 +265,7 @@ def _twist(rig: Rig) -> None:
     rig.below("sim/tool_state: twist is the rate of the pose", worst, 0.02 + 0.05 * speed, "m/s off")
 
 
-def _lost(rig: Rig) -> None:
+def _check_loss(rig: Rig) -> None:
     _activate(rig)
     rig.lose("control")
     received = rig.run(0.1 + rig.slack_s, quiet(rig))["robot/status"]

@@ -77,7 +77,7 @@ def field_covariances(a: Array, b: Array, standard: PressStandard) -> list[Array
     With an anatomy, the last two are of strips and of bone. Without one, distances count between points of the skin: on a steep
     side of a body, places are further apart than from above.
     """
-    on_a, on_b = (p if standard.places is None else standard.places.lifted(p) for p in (a, b))
+    on_a, on_b = (p if standard.places is None else standard.places.lift(p) for p in (a, b))
     parts = [smooth(on_a, on_b, length) for length in standard.lengths.fields_m]
     if (anatomy := standard.anatomy) is None:
         return parts

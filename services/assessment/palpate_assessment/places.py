@@ -57,7 +57,7 @@ class SampledPlaces:
         inside = self.mesh.find_simplex(places)
         return np.asarray((inside >= 0) & self.filled[inside])
 
-    def lifted(self, places: Array) -> Array:
+    def lift(self, places: Array) -> Array:
         """Return places [m] on the skin through the samples, shape (k, 2) -> (k, 3); outside it is as high as the nearest one."""
         height = np.asarray(self._height(places))
         outside = np.isnan(height)

@@ -138,7 +138,7 @@ class Sampler:
         read = [s for s in held if PRESS.read_s[0] <= s.time - deep <= PRESS.read_s[1]]
         depths = [s.depth for s in read]
         complete = len(read) > 0 and held[-1].time - deep >= PRESS.read_s[1] and max(depths) - min(depths) < PRESS.settled_m
-        sample = self._averaged(read) if complete else None
+        sample = self._average_of(read) if complete else None
         fall = np.array([(s.depth, s.force) for s in held if s.time <= deep and s.force > 0])
         fall = fall[(fall[:, 0] > PRESS.rise[0] * held[-1].depth) & (fall[:, 0] < PRESS.rise[1] * held[-1].depth)]
         if sample is None or len(fall) < _FEWEST:
@@ -149,9 +149,9 @@ class Sampler:
     def _average(self) -> ForceSample | None:
         """Return the sample of the present block, and begin the next one."""
         block, self._block = self._block, []
-        return self._averaged(block)
+        return self._average_of(block)
 
-    def _averaged(self, block: Sequence[ContactState]) -> ForceSample | None:
+    def _average_of(self, block: Sequence[ContactState]) -> ForceSample | None:
         if len(block) < _FEWEST or self._onset is None:
             return None
         time = np.array([s.time for s in block])

@@ -78,7 +78,7 @@ class SeenBreath:
         """Discard waiting states."""
         self._waiting.clear()
 
-    def settled(self, at_once: bool = False) -> list[ContactState]:
+    def take_settled(self, at_once: bool = False) -> list[ContactState]:
         """States that need not wait any longer, in order: their breath was seen, no image comes, or all are wanted `at_once`."""
         if not self._waiting:
             return []
@@ -87,13 +87,13 @@ class SeenBreath:
         until = max(until, self._exposed[-1]) if self._exposed else until
         count = sum(state.time <= until for state in self._waiting)
         ready, self._waiting = self._waiting[:count], self._waiting[count:]
-        return self._seen(ready)
+        return self._with_measured_breath(ready)
 
     def _follows(self, t: float) -> bool:
         """Return True if a later image is expected."""
         return self._shares is not None and bool(self._exposed) and t - self._exposed[-1] <= LONGEST_S
 
-    def _seen(self, states: Sequence[ContactState]) -> list[ContactState]:
+    def _with_measured_breath(self, states: Sequence[ContactState]) -> list[ContactState]:
         if self._shares is None or not states:
             return list(states)
         time, depth, followed = np.array([(state.time, state.depth, state.followed) for state in states]).T

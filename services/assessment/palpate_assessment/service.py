@@ -136,7 +136,7 @@ class AssessmentService(Service):
             return []
         self._moved_at = None
         self._breath.take(self._state(state))
-        settled = self._breath.settled(at_once=state.phase in FINISHED)
+        settled = self._breath.take_settled(at_once=state.phase in FINISHED)
         new = [sample for one in settled if (sample := self._sampler.add(one)) is not None]
         self.samples += new
         return new

@@ -124,7 +124,7 @@ def followed_for(breath: SeenBreath, seconds: float, delay: float = 0.15) -> lis
         if k % 10 == round(delay * 100) % 10 and t >= delay:
             breath.add_image(t - delay, true_breath(t - delay))
         breath.take(missed(t, 0.05))
-        settled += [(t, one) for one in breath.settled()]
+        settled += [(t, one) for one in breath.take_settled()]
     return settled
 
 
@@ -136,7 +136,7 @@ def test_depth_is_corrected_by_the_measured_breathing() -> None:
     assert [one.time for _, one in settled] == sorted(one.time for _, one in settled)
     assert max(t - one.time for t, one in settled if one.time > 0.2) < 0.26, "an image and its delay"
     assert np.abs([one.depth - DEPTH for one in seen]).max() < 1e-5
-    assert len(settled) + len(breath.settled(at_once=True)) == 500, "every state comes out once"
+    assert len(settled) + len(breath.take_settled(at_once=True)) == 500, "every state comes out once"
 
 
 def test_without_images_nothing_waits_and_nothing_changes() -> None:
@@ -144,7 +144,7 @@ def test_without_images_nothing_waits_and_nothing_changes() -> None:
     breath.perceive(VERTICES, SHARES)
     for t in (0.00, 0.01, 0.02):
         breath.take(missed(t))
-        assert [one.time for one in breath.settled()] == [t]
+        assert [one.time for one in breath.take_settled()] == [t]
 
 
 def test_a_camera_that_falls_silent_holds_nothing_back_for_longer_than_half_a_second() -> None:
@@ -154,7 +154,7 @@ def test_a_camera_that_falls_silent_holds_nothing_back_for_longer_than_half_a_se
     late = []
     for k in range(100, 300):
         breath.take(missed(0.01 * k))
-        late += [(0.01 * k - one.time, one) for one in breath.settled()]
+        late += [(0.01 * k - one.time, one) for one in breath.take_settled()]
     assert max(delay for delay, _ in late) <= 0.5 + 1e-9
     assert late[-1][1].depth == pytest.approx(DEPTH - true_breath(late[-1][1].time)), "as it was reported"
 

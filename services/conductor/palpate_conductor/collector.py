@@ -58,7 +58,7 @@ class KeptMessages(Sequence[Any]):
         for self._newest in messages:
             self._kept.append(self._encode(self._newest))
 
-    def kept_from(self, first: int) -> list[bytes]:
+    def messages_from(self, first: int) -> list[bytes]:
         """Return the messages from the one with index `first` on, as bytes."""
         return self._kept[first:]
 
@@ -130,7 +130,7 @@ class CollectedNews:
             name, value = field_.name, getattr(self._collected, field_.name)
             if isinstance(value, KeptMessages | list):
                 first, self._counts[name] = self._counts.get(name, 0), len(value)
-                further = value.kept_from(first) if isinstance(value, KeptMessages) else value[first:]
+                further = value.messages_from(first) if isinstance(value, KeptMessages) else value[first:]
                 news |= {name: further} if further else {}
             elif value is not self._newest.get(name):
                 news[name] = self._newest[name] = value

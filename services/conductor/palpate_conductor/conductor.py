@@ -251,7 +251,7 @@ class Conductor:
                 if role in self._roles and role not in finished:
                     self._keep_slot_or_lose(role, Failure(FailureCode.ROLE_LOST, how))
             self._lose_frozen(finished)
-            for role, how in self._slots.expired().items():
+            for role, how in self._slots.remove_expired().items():
                 reason = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
                 self._mark_lost(role, Failure(FailureCode.ROLE_LOST, reason))
             self._notify(*self._member.complaints(), *self._member.suspicions())

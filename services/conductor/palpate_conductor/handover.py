@@ -41,7 +41,7 @@ class Slots:
         self.replaced.add(role)
         return True
 
-    def expired(self) -> dict[str, str]:
+    def remove_expired(self) -> dict[str, str]:
         """Remove and return the slots that were not filled in time, with how each process left."""
         now = monotonic()
         late = {role: how for role, (since, how) in self.empty.items() if now - since > self.patience_s}

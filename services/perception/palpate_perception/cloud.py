@@ -269,7 +269,7 @@ class DepthFusion:
         mean = np.where(kept, offset, 0).sum(axis=1, dtype=np.float64) / np.maximum(kept.sum(axis=1), 1)
         return float(np.std(mean))
 
-    def fused(self) -> FusedDepth:
+    def fuse(self) -> FusedDepth:
         """Return the fused window. Raises ValueError without frames."""
         if not self._frames:
             raise ValueError("no depth frame to fuse: call add first")

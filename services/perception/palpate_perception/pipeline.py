@@ -111,7 +111,7 @@ class Pipeline:
 
         Targets and mesh are shifted with the patient by `shift` in A [m], shape (2,).
         """
-        fused = fusion.fused()
+        fused = fusion.fuse()
         origin = (fusion.window[0].start, fusion.window[1].start)
         depth = np.asarray(fused.depth, np.float64)
 

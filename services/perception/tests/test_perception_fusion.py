@@ -32,7 +32,7 @@ def fuse(images: list[np.ndarray]) -> DepthFusion:
 
 def test_the_mean_does_not_stick_to_the_steps_of_rounding() -> None:
     truth = np.broadcast_to(np.linspace(1.1, 1.1 + STEP, SHAPE[1]), SHAPE)
-    fused = fuse(frames(truth, 20)).fused()
+    fused = fuse(frames(truth, 20)).fuse()
     error = fused.depth - truth
     assert fused.frames == 20
     assert np.abs(error.mean(axis=0)).max() < 0.4e-3  # no column is drawn to a step
@@ -47,7 +47,7 @@ def test_frames_that_looked_past_an_edge_are_left_out() -> None:
     rng = np.random.default_rng(1)
     for image in images:
         image[rng.random(SHAPE) < 0.25] = 1.4
-    fused = fuse(images).fused()
+    fused = fuse(images).fuse()
     assert np.mean(np.abs(fused.depth - 1.1) < 3e-3) > 0.97
     assert fused.depth.mean() == pytest.approx(1.1, abs=3e-3)
 
@@ -56,7 +56,7 @@ def test_frames_that_looked_past_an_edge_are_left_out() -> None:
 def test_frames_of_a_camera_that_only_sends_noise_do_not_agree(noise_m: float, usable: bool) -> None:
     rng = np.random.default_rng(2)
     images = [image + np.float32(noise_m) * rng.standard_normal(SHAPE, np.float32) for image in frames(np.full(SHAPE, 1.1), 10)]
-    assert (fuse(images).fused().agreeing > PIPELINE.min_agreeing) == usable
+    assert (fuse(images).fuse().agreeing > PIPELINE.min_agreeing) == usable
 
 
 def test_invalid_pixels_do_not_count_and_never_valid_ones_stay_invalid() -> None:
@@ -65,7 +65,7 @@ def test_invalid_pixels_do_not_count_and_never_valid_ones_stay_invalid() -> None
         image[0] = np.nan
     for image in images:
         image[1] = np.nan
-    fused = fuse(images).fused()
+    fused = fuse(images).fuse()
     np.testing.assert_array_equal(fused.depth[0], images[9][0])
     assert np.isnan(fused.depth[1]).all()
     assert np.isnan(fused.sigma[1]).all()
@@ -80,8 +80,8 @@ def test_a_breathing_surface_shows_as_motion_and_noise_does_not() -> None:
     moving = [(image + offset).astype(np.float32) for image, offset in zip(still, swing, strict=True)]
     pixel = np.argwhere(np.ones(SHAPE, bool))
     quiet, breathing = fuse(still), fuse(moving)
-    assert quiet.motion(quiet.fused().depth, pixel) < 1e-4
-    assert breathing.motion(breathing.fused().depth, pixel) == pytest.approx(np.std(swing), rel=0.05)
+    assert quiet.motion(quiet.fuse().depth, pixel) < 1e-4
+    assert breathing.motion(breathing.fuse().depth, pixel) == pytest.approx(np.std(swing), rel=0.05)
 
 
 K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])

@@ -100,7 +100,7 @@ class ExaminationSequence:
             **dict.fromkeys(PALPATING, self._palpate),
             Phase.RETURN: self._return,
             Phase.ASSESS: self._assess,
-            Phase.HELD: self._held,
+            Phase.HELD: self._hold,
         }
 
     @property
@@ -222,7 +222,7 @@ class ExaminationSequence:
                 return
             if not self._known.exam.searched:
                 targets = apply(inverse(X_WA), perceived.positions)[:, :2]
-                remainder.wanted = before.wanted(targets, self._known.exam.spacing_m)
+                remainder.wanted = before.remaining_targets(targets, self._known.exam.spacing_m)
                 text = f"planning over {len(remainder.wanted)} of {count} targets that are left"
         course.enter(Phase.PLAN, now.t, text)
 
@@ -342,9 +342,9 @@ class ExaminationSequence:
         """Publish the final surface correction, unless the patient moved."""
         perceived, wall = self._course.perceived, self._sense.wall
         if perceived is not None and not self._remainder.rescans and not wall.breath.moved:
-            out.correction = wall.corrected(perceived.vertices, self._averaged)
+            out.correction = wall.heights_above(perceived.vertices, self._averaged)
 
-    def _held(self, now: Observation, out: ExamStep) -> Setpoint | None:
+    def _hold(self, now: Observation, out: ExamStep) -> Setpoint | None:
         setpoint = self._stops.step(now)
         self._views.asked = None  # a burst that was requested before the stop is requested again
         return self._palpate(now, out) if self.status.phase in PALPATING else setpoint

@@ -270,7 +270,7 @@ class Palpation:
                 yield from travel(self._motion, segment.path.length)
         yield from _done()
 
-    def _interrupted(self) -> Stages[None]:
+    def _after_interruption(self) -> Stages[None]:
         """Return the lift after an interruption, the rest of the segment and the remaining ones."""
         yield from self._lift()
         yield from self._remaining()
@@ -351,7 +351,7 @@ class Palpation:
 
     def _interrupt(self) -> None:
         """Lift off from whatever the arm does."""
-        self._continue_with(self._interrupted())
+        self._continue_with(self._after_interruption())
 
     def _check_force(self, contact: ContactMeasurement) -> None:
         """Lift off at the soft-stop force and skip the targets there; before a sudden force, and press there again."""
@@ -391,7 +391,7 @@ class Palpation:
 
     def _check_waits(self) -> None:
         """End strokes that wait for too long: without failure if tissue has been measured."""
-        end = self.waits.step(self._awaited())
+        end = self.waits.step(self._present_wait())
         if not end:
             return
         if end.reason is Reason.NO_REQUEST:
@@ -401,7 +401,7 @@ class Palpation:
         else:
             self.leave(end)
 
-    def _awaited(self) -> Wait | None:
+    def _present_wait(self) -> Wait | None:
         """Return what the arm waits for. A pause is not counted here: its stop has a bound."""
         stage, open_gate = self.stage, self._watch.open
         if self.recovery.paused or self.recovery.ending:

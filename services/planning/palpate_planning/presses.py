@@ -33,7 +33,7 @@ class RequestedPresses:
         """Plan the next press at `t` [ns], or append it to the strokes."""
         if self._request is not None:
             self._planned, self._request = self._request, None
-            request = self._planned.moved(shift_A)
+            request = self._planned.shift_by(shift_A)
             if request.xy is None:
                 palpation.more = False
             else:

@@ -130,4 +130,4 @@ class ExamStep:
     touched: PublishedTouch | None = None
     """The touch of this step, if there was one."""
     correction: tuple[Array, Array] | None = None
-    """Correction of the perceived surface's vertices, from `Wall.corrected`, once: when the strokes are over."""
+    """Correction of the perceived surface's vertices, from `Wall.heights_above`, once: when the strokes are over."""

@@ -301,7 +301,7 @@ class Descent:
 
     def learn(self, now: StrokeInput) -> None:
         """Correct the wall by the touch."""
-        self.touched, outward = self._motion.wall.touched(now.contact.foot, self._onset.touch(), self.stroke, now.t)
+        self.touched, outward = self._motion.wall.touch(now.contact.foot, self._onset.touch(), self.stroke, now.t)
         self._motion.shift(outward)
 
     def revise(self) -> None:

@@ -168,7 +168,7 @@ def test_a_better_surface_needs_a_smaller_correction() -> None:
     correction = TouchCorrection()
     for place, field in zip(PLACES, bent, strict=True):
         correction.touch(HeightMeasurement(place, float(tilted(place) + field), 2e-4))
-    better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
+    better = correction.for_surface(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
     assert better._fit.roughness < correction._fit.roughness
     heights, sigmas = better.over(BETWEEN)
     assert heights == pytest.approx(tilted(BETWEEN), abs=2e-4)

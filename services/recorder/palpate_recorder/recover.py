@@ -118,7 +118,7 @@ def _number(path: Path) -> tuple[int, str]:
 
 def _channel(record: ChannelRecord, schema: Schema) -> Channel:
     kind = recorded_type(record, schema)
-    profile = _offered(record)
+    profile = _offered_qos(record)
     return Channel(
         topic=f"/{record.topic.removeprefix('/')}",
         type=kind.name,
@@ -130,7 +130,7 @@ def _channel(record: ChannelRecord, schema: Schema) -> Channel:
     )
 
 
-def _offered(record: ChannelRecord) -> dict[str, Any]:
+def _offered_qos(record: ChannelRecord) -> dict[str, Any]:
     """Return the first quality of service that a channel was offered with; empty if that is not known."""
     with suppress(InputError, LookupError, TypeError, ValueError):
         return dict(parse_yaml(record.metadata.get("offered_qos_profiles", ""), record.topic)[0])

@@ -90,7 +90,7 @@ def test_the_step_settles_where_the_energy_is_least(stiffening: float, tension: 
     def energy(u: np.ndarray) -> tuple[float, np.ndarray]:
         pressed = np.maximum(u, 0.0)
         b = np.full(len(u), stiffening)
-        stored = 0.5 * u @ solid @ u + gain @ (wall.stored(u, b) + 0.5 * muscle * pressed**2)
+        stored = 0.5 * u @ solid @ u + gain @ (wall.stored_energy(u, b) + 0.5 * muscle * pressed**2)
         return 1e3 * stored, 1e3 * (solid @ u + gain * (wall.stress(u, b) + muscle * pressed))
 
     least = minimize(

@@ -122,7 +122,7 @@ class RosCameraService(Service):
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
-        exposed = self._exposed(t, stamp)
+        exposed = self._exposure_time(t, stamp)
         outbox = messages.small_of(exposed, depth, pinhole)
         if self._wanted and not triggers and exposed >= self._asked:
             self._wanted -= 1
@@ -130,7 +130,7 @@ class RosCameraService(Service):
             outbox |= messages.whole_image(exposed, depth, pinhole)
         return outbox
 
-    def _exposed(self, t: int, stamp: int) -> int:
+    def _exposure_time(self, t: int, stamp: int) -> int:
         """Return the time of exposure [ns] in the run's time, now `t`, of an image with ROS time `stamp`; `t` if unknown."""
         age = self._now() - stamp
         return max(t - age, 0) if 0 <= age <= TUNING.oldest_ns else t

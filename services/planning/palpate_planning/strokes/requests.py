@@ -27,7 +27,7 @@ class PressRequest(NamedTuple):
     reason: str = ""
     """Text for the end of the search."""
 
-    def moved(self, shift_A: Array) -> PressRequest:
+    def shift_by(self, shift_A: Array) -> PressRequest:
         """Return the same place of a body that has moved by `shift_A` [m], shape (2,), since the first view."""
         return self if self.xy is None else self._replace(xy=self.xy + shift_A)
 

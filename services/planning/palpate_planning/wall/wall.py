@@ -111,7 +111,7 @@ class TouchCorrection:
         fits = (_fit(float(a), self._expected, self._places, heights, errors) for a in ROUGHNESSES)
         self._fit = max(fits, key=lambda fit: fit.log_probability)
 
-    def averaged(self, outward: Callable[[Array], Array]) -> TouchCorrection:
+    def for_surface(self, outward: Callable[[Array], Array]) -> TouchCorrection:
         """Return the correction, from the same touches, of a better surface, `outward` [m] of this one at positions (n, 2)."""
         better = TouchCorrection(PRIOR.mean_image_roughness)
         less = outward(self._places)
@@ -216,7 +216,7 @@ class Wall:
         self.perceived, self.shift_A, self._touched = perceived, np.zeros(2), None
         self.correction.blur()
 
-    def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
+    def heights_above(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
         """Return the height of the wall above vertices of the perceived surface and its SD [m], shapes (n,).
 
         Uses all touches, and the height of the mean of all images above these vertices [m] if `averaged` is given.
@@ -224,7 +224,7 @@ class Wall:
         xy = np.array([self.perceived.xy(p) for p in vertices_W])
         if averaged is None:
             return self.correction.over(xy)
-        height, sigma = self.correction.averaged(NearestNDInterpolator(xy, averaged)).over(xy)
+        height, sigma = self.correction.for_surface(NearestNDInterpolator(xy, averaged)).over(xy)
         return averaged + height, sigma
 
     def point(self, foot: Foot, correction: float) -> tuple[Array, Array]:
@@ -253,7 +253,7 @@ class Wall:
             correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t))
         )
 
-    def touched(self, foot: Foot, touch: WallDepth, stroke: int, t: int) -> tuple[PublishedTouch, float]:
+    def touch(self, foot: Foot, touch: WallDepth, stroke: int, t: int) -> tuple[PublishedTouch, float]:
         """Update the correction by a touch under `foot` at `t` [ns]; return the touch and the change in wall height [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
         moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)

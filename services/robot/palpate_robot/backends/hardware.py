@@ -250,14 +250,14 @@ class HardwareService(Service):
             if not np.isfinite(values).all():
                 self._driver.hold(t, HoldCause.DEVICE, f"F/T reading {values}: must be finite")
                 continue
-            self._wrench, self._wrench_at = self._corrected(values), t
+            self._wrench, self._wrench_at = self._wrench_on_sensor(values), t
         if fresh:
             self._states += 1
             self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque))
             self._summed += 1
         return fresh
 
-    def _corrected(self, reading: Array) -> Array:
+    def _wrench_on_sensor(self, reading: Array) -> Array:
         """Return the wrench of tool and environment on the sensor in its axes, shape (6,)."""
         return np.concatenate((self._R_ST @ reading[:3], self._R_ST @ reading[3:]))
 

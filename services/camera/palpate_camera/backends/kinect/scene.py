@@ -160,7 +160,7 @@ class Scene:
             self._merged = merged
         return self._merged
 
-    def seen(self, name: str) -> NDArray[np.bool_]:
+    def visible_pixels(self, name: str) -> NDArray[np.bool_]:
         """Return the pixels of `view` that show a layer, shape (height, width)."""
         w = self._layers[name][1].w
         return (w > 0) & (w >= self.view().w)
@@ -204,7 +204,7 @@ class Links:
         self._triangles: Triangles = np.empty((0, 3), np.uint32)
         """Triangles of the links `_names`, which rarely change."""
 
-    def placed(self, X_WL: dict[str, Array]) -> Mesh | None:
+    def place(self, X_WL: dict[str, Array]) -> Mesh | None:
         """Return the links of which the pose is known, in world; None when there is none."""
         names = [name for name in self._shapes if name in X_WL]
         if not names:

@@ -64,7 +64,7 @@ class CameraService(Service):
         if surface is None:
             return {}
         skin, poses = surface_mesh(surface), inbox.latest("sim/link_poses")
-        robot = None if poses is None else self._links.placed(link_poses(poses))
+        robot = None if poses is None else self._links.place(link_poses(poses))
         on_s = (t - self._on_since) / NS
         outbox = messages.small(t, self._small.take(on_s, skin, robot, self._bias), self._small.pinhole)
         if self._frames_left:
@@ -94,7 +94,7 @@ class _Picture:
         self._scene.put("abdomen", skin)
         if robot is not None:
             self._scene.put("robot", robot, ROBOT_TOLERANCE_M)
-        image = self._noise.image(self._scene.view(), bias.image(on_s, self._scene.seen("abdomen"), self._every))
+        image = self._noise.image(self._scene.view(), bias.image(on_s, self._scene.visible_pixels("abdomen"), self._every))
         image[bias.lost[self._every, self._every]] = np.nan
         return image
 

@@ -48,8 +48,8 @@ class MeasuredJoints(MeasuredArm):
                 return False
             self._names, self._order = names, [names.index(name) for name in self._arm.joint_names]
         try:
-            q, v = self._chosen(state.position), self._chosen(state.velocity)
-            torque = self._chosen(state.effort) if self._torques else self.torque
+            q, v = self._in_order(state.position), self._in_order(state.velocity)
+            torque = self._in_order(state.effort) if self._torques else self.torque
         except IndexError:
             self._fault = "joint states: want a position, a velocity and an effort of each joint"
             return False
@@ -60,7 +60,7 @@ class MeasuredJoints(MeasuredArm):
         self.received, self._stamp, self._fault = t, stamp, None
         return True
 
-    def _chosen(self, values: Any) -> Array:
+    def _in_order(self, values: Any) -> Array:
         return np.array(values, dtype=float)[self._order]
 
     def fault(self, t: int) -> str | None:

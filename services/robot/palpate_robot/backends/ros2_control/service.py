@@ -64,8 +64,8 @@ class Ros2ControlService(HardwareService):
         """Return what the base returns, and if the first contact was checked."""
         return {**super().finish(), "first_contact_checked": self._first.passed}
 
-    def _corrected(self, reading: Array) -> Array:
-        wrench = super()._corrected(reading)
+    def _wrench_on_sensor(self, reading: Array) -> Array:
+        wrench = super()._wrench_on_sensor(reading)
         if self._profile.ft_weight:
             return wrench
         return wrench + tool_load(self._robot.tool_mass_kg, self._model.at(self._arm.q).up_S)
@@ -73,7 +73,7 @@ class Ros2ControlService(HardwareService):
     def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
         if not active:
             self._followed.reset()
-        elif fault := self._unexpected(t, values, load):
+        elif fault := self._check_response(t, values, load):
             self._driver.hold(t, HoldCause.DEVICE, fault)
             return  # the next state is answered by the hold
         if self._level is CommandLevel.SETPOINT:
@@ -86,7 +86,7 @@ class Ros2ControlService(HardwareService):
         else:
             super()._send(t, values, load, active=active)
 
-    def _unexpected(self, t: int, values: Array, load: CarriedLoad) -> str:
+    def _check_response(self, t: int, values: Array, load: CarriedLoad) -> str:
         """Return a message if the arm does not follow or the first contact has the wrong sign, else an empty text."""
         if self._first.wrong(t, self._external_S):
             pull = f"{self._external_S[2]:+.1f} N along the tool"

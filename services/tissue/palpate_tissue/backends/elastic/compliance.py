@@ -261,9 +261,9 @@ class _Body(NamedTuple):
             raise UserError("a half-space must be uniform: use a finite thickness_m")
         arrays = (model.vertices, model.normals, model.areas, young, model.fixed)
         key = content_key("compliance", _CODE, *arrays, lesions, self.thickness, self.poisson, self.pitch)
-        return remember(key, lambda: self._changed(lesions))
+        return remember(key, lambda: self._update_compliance(lesions))
 
-    def _changed(self, lesions: tuple[Lesion, ...]) -> Array32:
+    def _update_compliance(self, lesions: tuple[Lesion, ...]) -> Array32:
         """Return S with the last lesion from S without it, or S of the healthy body from that of the uniform layer."""
         after = ModulusField(self.model, lesions)
         young = after.at_skin()[self.free]

@@ -118,7 +118,7 @@ class VertexSprings(NamedTuple):
     def energy(self, u: Array, activation: float) -> float:
         """Return the stored energy [J]."""
         pressed = np.maximum(u, 0.0)
-        return float(self.gain @ (wall.stored(u, self.stiffening) + 0.5 * activation * self.tension * pressed**2))
+        return float(self.gain @ (wall.stored_energy(u, self.stiffening) + 0.5 * activation * self.tension * pressed**2))
 
 
 @compiled

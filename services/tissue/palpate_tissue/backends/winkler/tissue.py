@@ -353,5 +353,5 @@ class WinklerTissue(TissueBackend):
                 stored += 0.5 * g * (stretch @ (K @ stretch))
         model = self.model
         muscle = self.activation * model.tension * np.maximum(u, 0.0) ** 2 / 2
-        stored += (model.stiffness * model.areas) @ (wall_law.stored(u, model.stiffening) + muscle)
+        stored += (model.stiffness * model.areas) @ (wall_law.stored_energy(u, model.stiffening) + muscle)
         return float(stored + self.friction.energy())
