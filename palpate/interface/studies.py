@@ -10,7 +10,7 @@ import pandas as pd
 from palpate.interface.scenarios import paths
 from palpate.study.cases import Request, cases_of, command_of
 from palpate.study.folder import RunRecord, default_folder, open_folder
-from palpate.study.runner import cluster, cores, run_cases
+from palpate.study.runner import count_cores, open_workers, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
 from palpate.study.summary import PAGE, conclude
 from palpate_models.scenario.load import as_settings
@@ -106,7 +106,7 @@ def study(
     path = default_folder(chosen.name, split) if out is None else Path(out)
     folder, manifest = open_folder(path, chosen.name, cases, command_of(str(source), request, methods or ()))
     if folder.missing(cases):
-        with cluster(workers or cores()) as client:
-            run_cases(folder, cases, client, lambda _: None)
+        with open_workers(workers or count_cores()) as opened:
+            run_cases(folder, cases, opened, lambda _: None)
     record, _ = conclude(folder, manifest)
     return StudyResult(path, record)

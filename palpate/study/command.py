@@ -100,7 +100,7 @@ def run(  # noqa: PLR0913 - the options of a command
         refuse("--shard and --scheduler cannot be combined")
     from palpate.study.cases import Request, cases_of, command_of, secret_of
     from palpate.study.folder import default_folder, open_folder
-    from palpate.study.runner import part_of
+    from palpate.study.runner import select_shard
     from palpate.study.spec import load_study
 
     console = SteadyConsole(stderr=True, quiet=quiet)
@@ -108,7 +108,7 @@ def run(  # noqa: PLR0913 - the options of a command
     secret = None if seeds_file is None else secret_of(seeds_file, study)
     request = Request(cast("Split", split), number, settings or (), secret)
     cases = cases_of(study, request)
-    own = part_of(cases, shard) if shard else cases
+    own = select_shard(cases, shard) if shard else cases
     path = out or default_folder(study.name, split)
     folder, manifest = open_folder(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
     _examine(console, folder, own, (workers, scheduler), runs)
@@ -169,7 +169,7 @@ def _choose(study: Study, only: Sequence[str] | None, services: Sequence[str] | 
 def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tuple[int | None, str | None], runs: bool) -> None:
     """Run the cases without an outcome on a number of local workers or a scheduler. Ends the command if they cannot be run."""
     from palpate.study.folder import Outcome
-    from palpate.study.runner import StudyStopped, cluster, cores, run_cases
+    from palpate.study.runner import StudyStopped, count_cores, open_workers, run_cases
 
     todo = len(folder.missing(cases))
     if len(cases) > todo:
@@ -178,7 +178,8 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
         return
     finished = count(1)
     try:
-        with cluster(where[0] or cores(), where[1]) as workers, CaseDisplay(console, console.quiet, "cases") as display:
+        opened = open_workers(where[0] or count_cores(), where[1])
+        with opened as workers, CaseDisplay(console, console.quiet, "cases") as display:
             console.print(f"{todo} cases, {workers.count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
             if workers.client.dashboard_link:
                 console.print(f"workers: {workers.client.dashboard_link}", style="dim", highlight=False, soft_wrap=True)

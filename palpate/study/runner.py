@@ -42,28 +42,28 @@ from palpate_conductor.outcome import Timing
 from palpate_errors import RunError
 from palpate_models.scenario.schema import Scenario
 
-LIMIT_S: Final = {"whole": 3600.0, "quick": 300.0}
+CASE_LIMIT_S: Final = {"whole": 3600.0, "quick": 300.0}
 """Time limit of a case; one that takes longer counts as hung."""
-KEEP_MEMORY: Final = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 25)}
+MALLOC_SETTINGS: Final = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 25)}
 """Makes glibc's malloc keep freed memory for the next arrays; page faults would cost a tenth of a quick case."""
 KIB: Final = 1024
 """Unit of `ru_maxrss` on Linux."""
 
 
-def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
+def examine_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
     """Examine cases, given as JSON, one after another in one process; the task of a Dask worker.
 
-    Returns the attempts as JSON, in order. Fewer than there are cases if the process ended early: the last one is then the
-    failure of the case that it was busy with. `runs`: folder on the worker for the results of whole examinations.
+    Returns the attempts as JSON, in order. If the process ends early the list is shorter than `batch` and its last attempt is the
+    failure of the case being examined. `runs`: folder on the worker for the results of whole examinations.
     """
     cases = [Case.model_validate_json(text) for text in batch]
     periods = ",".join(f"{role}={period}" for role, period in cases[0].periods.items())
-    environment = {**os.environ, **FIXED, **KEEP_MEMORY, **({variable("periods"): periods} if periods else {})}
-    limit_s = LIMIT_S[cases[0].tier] * len(cases)
+    environment = {**os.environ, **FIXED, **MALLOC_SETTINGS, **({variable("periods"): periods} if periods else {})}
+    limit_s = CASE_LIMIT_S[cases[0].tier] * len(cases)
     command = [sys.executable, "-m", "palpate.study.runner", *([] if runs is None else [runs])]
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 command,
                 input="\n".join(batch) + "\n",
                 stdout=subprocess.PIPE,
@@ -74,26 +74,25 @@ def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
                 start_new_session=True,  # Ctrl-C goes to the study, which ends its processes
                 check=False,
             )
-            output, why = done.stdout, f"its process ended with status {done.returncode}"
+            output, cause = process.stdout, f"its process ended with status {process.returncode}"
         except subprocess.TimeoutExpired as error:
             partial = error.stdout or b""
             output = partial.decode() if isinstance(partial, bytes) else partial
-            why = f"took longer than {limit_s:.0f} s"
+            cause = f"took longer than {limit_s:.0f} s"
         log.seek(0)
-        lines = log.read().strip().splitlines()
+        logged = log.read().strip().splitlines()
     attempts = [line for line in output.splitlines(keepends=True) if line.endswith("\n")]
     if len(attempts) < len(cases):
-        cause = f"{why}: {lines[-1]}" if lines else why
-        attempts.append(Attempt(why=cause).model_dump_json())
+        attempts.append(Attempt(why=f"{cause}: {logged[-1]}" if logged else cause).model_dump_json())
     return attempts
 
 
 def examine(case: Case, runs: Path | None = None) -> Attempt:
     """Examine a patient in this process. A failed run is part of the report; errors of the code are raised."""
-    begin, used = perf_counter(), _core_s()
+    begin, processor_begin = perf_counter(), _processor_time_s()
     for path, known in case.files.items():
-        if file_hash(path) != known:
-            raise RunError(f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}")
+        if (found := file_hash(path)) != known:
+            raise RunError(f"{path} has changed since the study was made: SHA-256 {found[:16]}..., expected {known[:16]}...")
     scenario = Scenario.model_validate(case.scenario)
     examinations: int | None = None
     assess_s: float | None
@@ -105,7 +104,7 @@ def examine(case: Case, runs: Path | None = None) -> Attempt:
         report, assess_s = quick.report, quick.assess_s
         examinations = loop_errors(scenario).examinations
     else:
-        report, assess_s = _whole(scenario, case, runs)
+        report, assess_s = _examine_whole(scenario, case, runs)
     # a composed run is forked and shares memory
     peaks = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return Attempt(
@@ -115,12 +114,12 @@ def examine(case: Case, runs: Path | None = None) -> Attempt:
         peak_memory_bytes=KIB * (max(peaks) if case.runtime == "lockstep" else sum(peaks)),
         wall_time_s=perf_counter() - begin,
         assess_time_s=assess_s,
-        core_s=_core_s() - used,
+        core_s=_processor_time_s() - processor_begin,
         loop_examinations=examinations,
     )
 
 
-def _whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, float | None]:
+def _examine_whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, float | None]:
     """Return the report, and the wall time of the assessment [s] where it is known."""
     with tempfile.TemporaryDirectory(prefix="palpate-case-") as temporary:
         folder = Path(temporary)
@@ -143,19 +142,20 @@ def _whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, f
     return report, None if blame is None else blame["steps"] * blame["compute"] / 1e6
 
 
-def _core_s() -> float:
+def _processor_time_s() -> float:
+    """Return the processor time of this process and its ended children [s]."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return process_time() + children.ru_utime + children.ru_stime
 
 
-def _answer(line: str, runs: Path | None) -> Attempt:
+def _examine_line(line: str, runs: Path | None) -> Attempt:
     try:
         return examine(Case.model_validate_json(line), runs)
     except Exception as error:  # any error is a failed attempt at this case
         return Attempt(why=f"{type(error).__name__}: {error}", code=code_digest())
 
 
-def _end_with(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     """End this process as soon as its parent has ended."""
     while os.getppid() == parent:
         sleep(1.0)
@@ -174,7 +174,7 @@ class PoolTuning(NamedTuple):
 
 
 POOL: Final = PoolTuning()
-BATCH: Final = {"whole": 1, "quick": 8}
+MAX_CASES: Final = {"whole": 1, "quick": 8}
 """Maximum number of cases of one task; they share a process."""
 
 
@@ -192,14 +192,14 @@ class Workers:
     """Cases at a time, as known at the start: a cluster may grow."""
 
 
-def cores() -> int:
+def count_cores() -> int:
     """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 @contextmanager
-def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
-    """`count` worker threads in this process, or the workers of a scheduler elsewhere. Raises StudyError.
+def open_workers(count: int, scheduler: str | None = None) -> Iterator[Workers]:
+    """Yield `count` worker threads of this process, or the workers of a scheduler elsewhere. Raises StudyError.
 
     Local workers are threads because each case is examined in a process of its own.
     """
@@ -218,53 +218,53 @@ def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
                     dashboard_address="127.0.0.1:8787",
                     silence_logs=logging.CRITICAL,
                 )
-                stack.callback(_end_cases)
+                stack.callback(_kill_case_processes)
                 stack.enter_context(local)
                 client = stack.enter_context(Client(local))
             else:
                 client = stack.enter_context(Client(scheduler, timeout=POOL.connect_s))
         except (OSError, ValueError, TimeoutError) as error:
             raise StudyError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
-        known = sum(client.nthreads().values()) or 1
+        started = sum(client.nthreads().values()) or 1
         executor = client.get_executor(pure=False)
         if scheduler is None:
-            stack.callback(_end_cases)
+            stack.callback(_kill_case_processes)
         stack.callback(executor.shutdown, wait=False)
-        yield Workers(client, executor, known)
+        yield Workers(client, executor, started)
 
 
-def _end_cases() -> None:
+def _kill_case_processes() -> None:
     """End the case processes of an interrupted study, so that the threads that wait for them end."""
     for child in psutil.Process().children():
         if "palpate.study.runner" in child.cmdline():
             child.kill()
 
 
-def part_of(cases: Sequence[Case], shard: str) -> list[Case]:
+def select_shard(cases: Sequence[Case], shard: str) -> list[Case]:
     """Return every n-th case from the i-th, for a shard `i/n`. Raises StudyError."""
-    words = re.fullmatch(r"(\d+)/(\d+)", shard)
-    if words is None or not 1 <= int(words[1]) <= int(words[2]):
+    match = re.fullmatch(r"(\d+)/(\d+)", shard)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise StudyError(f"--shard {shard}: want i/n with 1 <= i <= n, such as 2/5")
-    return list(cases[int(words[1]) - 1 :: int(words[2])])
+    return list(cases[int(match[1]) - 1 :: int(match[2])])
 
 
 def run_cases(
     folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], *, runs: bool = False
 ) -> None:
-    """Examine all cases without an outcome, in any order, and calls `done` after each; note the session. Raises StudyStopped.
+    """Examine all cases without an outcome, in any order; call `done` after each and append the session to the folder.
 
-    `runs`: keep the results of whole examinations in the folder `runs`.
+    `runs`: keep the results of whole examinations in the folder `runs`. Raises StudyStopped.
     """
     begin, finished = monotonic(), 0
-    todo, kept = folder.missing(cases), str((folder.path / "runs").resolve()) if runs else None
+    runs_folder = str((folder.path / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
     failures: defaultdict[str, list[str]] = defaultdict(list)
 
     def submit(batch: list[Case]) -> None:
-        running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch], kept)] = batch
+        running[workers.executor.submit(examine_batch, [case.model_dump_json() for case in batch], runs_folder)] = batch
 
     try:
-        for batch in _batches(todo, workers.count):
+        for batch in _batches(folder.missing(cases), workers.count):
             submit(batch)
         while running:
             ended, _ = wait(running, timeout=POOL.poll_s, return_when=FIRST_COMPLETED)
@@ -293,12 +293,12 @@ def _batches(cases: Sequence[Case], workers: int) -> Iterator[list[Case]]:
     """Yield consecutive cases with the same periods, which are set for a whole process, enough batches for all workers."""
     for _, group in groupby(cases, key=attrgetter("periods")):
         same = list(group)
-        size = max(1, min(BATCH[same[0].tier], len(cases) // (POOL.tasks_per_worker * workers)))
+        size = max(1, min(MAX_CASES[same[0].tier], len(cases) // (POOL.tasks_per_worker * workers)))
         yield from (same[k : k + size] for k in range(0, len(same), size))
 
 
 def _attempts(future: Future[list[str]], batch: Sequence[Case]) -> list[Attempt]:
-    """Return the attempts of a batch. A batch whose workers are lost repeatedly counts as their cause."""
+    """Return the attempts of a batch. If Dask gives up on a batch (KilledWorker), every case in it counts as failed."""
     from distributed import KilledWorker  # noqa: PLC0415 - takes a second
 
     if future.cancelled():
@@ -317,15 +317,15 @@ def _outcome(case: Case, attempt: Attempt, failures: list[str]) -> Outcome | Non
         failures.append(attempt.why)
         if len(failures) < ATTEMPTS:
             return None
-    stated = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
+    fields = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
     status: Literal["done", "failed"] = "done" if attempt.why is None else "failed"
-    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), failures=failures, **stated)
+    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), failures=failures, **fields)
 
 
 if __name__ == "__main__":
-    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries is not an answer
+    Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
+    attempts_out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries is not an attempt
     for text in sys.stdin.read().splitlines():
-        answers.write(_answer(text, Path(sys.argv[1]) if len(sys.argv) > 1 else None).model_dump_json() + "\n")
-        answers.flush()
+        attempts_out.write(_examine_line(text, Path(sys.argv[1]) if len(sys.argv) > 1 else None).model_dump_json() + "\n")
+        attempts_out.flush()

@@ -21,7 +21,7 @@ from synthetic import TOY, study
 from palpate.report.rows import FindingRow, FindingScore
 from palpate.study.cases import Case, cases_of
 from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, open_folder
-from palpate.study.runner import StudyStopped, cluster, part_of, run_cases
+from palpate.study.runner import StudyStopped, open_workers, run_cases, select_shard
 from palpate.study.spec import StudyError
 from palpate.study.summary import write_tables
 from palpate_models.scenario.load import load_scenario
@@ -33,7 +33,7 @@ CASES = cases_of(study())
 def run(path: Path, every: list[Case], cases: list[Case], count: int = 1, runs: bool = False) -> Folder:
     folder = Folder(path)
     folder.open(manifest_of("toy", every))
-    with cluster(count) as workers:
+    with open_workers(count) as workers:
         run_cases(folder, cases, workers, lambda _: None, runs=runs)
     return folder
 
@@ -86,7 +86,7 @@ def test_the_digest_is_that_of_two_workers_in_another_order(folder: Path, tmp_pa
 def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "one", tmp_path / "two"]
     for index, part in enumerate(parts, 1):
-        own = part_of(CASES, f"{index}/2")
+        own = select_shard(CASES, f"{index}/2")
         Folder(part).open(manifest_of("toy", CASES, f"palpate study {part}/toy.yaml"))
         for case in own:  # the work of another machine
             Folder(part).case_file(case.case_id).write_bytes(Folder(folder).case_file(case.case_id).read_bytes())
@@ -129,7 +129,7 @@ def test_a_study_continues_after_its_scheduler_was_killed(
     address, head = scheduler
     own = Folder(tmp_path)
     own.open(manifest_of("toy", CASES))
-    with pytest.raises(StudyStopped), cluster(1, address) as workers:
+    with pytest.raises(StudyStopped), open_workers(1, address) as workers:
         _strike(_case_process, lambda _: head.kill())
         run_cases(own, CASES, workers, lambda _: None)
     assert own.missing(CASES)
@@ -212,7 +212,7 @@ def test_a_service_that_is_changed_during_a_study_is_not_examined_with(tmp_path:
     own.write_text("from palpate_assessment.service import create  # changed\n")
     outcome = run(tmp_path, cases, cases).outcome(cases[0].case_id)
     assert len(outcome.failures) == ATTEMPTS
-    assert all("own.py is not the file that the study was made with" in why for why in outcome.failures)
+    assert all("own.py has changed since the study was made" in why for why in outcome.failures)
 
 
 def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
