@@ -21,6 +21,7 @@ COLUMNS = ("mode", "fault", "target", "after", "first sign", "arm", "force", "en
 
 
 def faults(  # noqa: PLR0913 - the options of a command
+    context: typer.Context,
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
@@ -37,6 +38,7 @@ def faults(  # noqa: PLR0913 - the options of a command
 
     `--kind lie`: services that send wrong values.
     """
+    from palpate.run.folder import lock_output
     from palpate.study.folder import code_digest
     from palpate_benchmarks import lies
     from palpate_benchmarks.campaign import cases, draw_cases, run_case
@@ -48,6 +50,7 @@ def faults(  # noqa: PLR0913 - the options of a command
         for value in given:
             if value not in known:
                 refuse(f"{name} {value}: allowed are {', '.join(known)}")
+    context.with_resource(lock_output(out))
     found = _load(out)
     todo = list(cases(modes, kinds, only or ()))
     if LIE in kinds:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from palpate.console import SteadyConsole
 from palpate.run.conclusion import conclude
-from palpate.run.folder import lock_folder
+from palpate.run.folder import lock_output
 from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
@@ -35,7 +35,7 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
         raise UserError(f"--out {out}: it holds the results of a run; `palpate prepare --out {out}` moves them away")
     session = open_session()
     roles = (*workers(chosen), *observers)
-    with results_first(), lock_folder(out):
+    with results_first(), lock_output(out):
         with RunDisplay(console, quiet, chosen.exam) as display:
             timing = Timing(wallclock, 1.0 if realtime else None)
             result = conduct(session, roles, display.show, timing=timing, tree=FrameTree(exam_input(chosen)))

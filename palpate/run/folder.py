@@ -78,7 +78,7 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
-        with lock_folder(path):
+        with lock_output(path):
             if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
                 what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
                 raise UserError(f"--out {path}: it holds {what}; name another folder, or --overwrite to remove it first")
@@ -96,7 +96,7 @@ def _move_away(path: Path) -> Path:
     if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
         raise UserError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with lock_folder(path):
+    with lock_output(path):
         try:
             return path.rename(aside)
         except OSError as error:
@@ -104,25 +104,26 @@ def _move_away(path: Path) -> Path:
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock a results folder. A killed run leaves the file of the lock. Raises UserError if another run holds it."""
+def lock_output(out: Path) -> Iterator[None]:
+    """Lock a results folder or file. A killed run leaves the file of the lock. Raises UserError if another run holds it."""
+    lock = out / LOCK if out.is_dir() else out.with_name(f".{out.name}.lock")
     try:
-        file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise UserError(f"--out {folder}: cannot be written into: {error.strerror}") from None
+        raise UserError(f"--out {out}: cannot be written into: {error.strerror}") from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         holder = os.read(file, 32).decode(errors="replace").strip() or "unknown"
         os.close(file)
-        raise UserError(f"--out {folder}: a run is writing into it (process {holder}); name another folder") from None
+        raise UserError(f"--out {out}: a run is writing into it (process {holder}); name another") from None
     try:
         os.ftruncate(file, 0)
         os.write(file, f"{os.getpid()}\n".encode())
         yield
     finally:
         with suppress(OSError):  # the folder may be gone, or read-only by now
-            (folder / LOCK).unlink()
+            lock.unlink()
         os.close(file)
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
+from palpate.run.folder import lock_output
 from palpate.run.inputs import scan_over
 from palpate_errors import ExitStatus
 from palpate_models.patient.phantom import build_phantom
@@ -99,6 +100,12 @@ def test_other_commands_refuse_bad_input(words: str, said: str, tmp_path: Path) 
     if words == "faults":
         (tmp_path / "faults.csv").write_text("[1, 2")
     assert said in refused(*words.split())
+
+
+def test_a_second_campaign_into_the_same_file_is_refused(tmp_path: Path) -> None:
+    with lock_output(tmp_path / "faults.csv"):
+        assert "faults.csv: a run is writing into it" in refused("faults", "--out", str(tmp_path / "faults.csv"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", scenario_names())

@@ -20,7 +20,7 @@ from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import conduct_others
-from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_folder, results_folder, unless_begun
+from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
@@ -55,7 +55,7 @@ def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Pa
     assert run_of(tmp_path) not in ("", run)
     assert {"notes.txt", "scenario.yaml"} <= {path.name for path in tmp_path.iterdir()}
     assert not (tmp_path / "report.json").exists()
-    with lock_folder(tmp_path):
+    with lock_output(tmp_path):
         assert CliRunner().invoke(app_for("prepare"), words).exit_code == 2
     assert len(list(tmp_path.glob("2*"))) == 1
 
