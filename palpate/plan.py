@@ -44,7 +44,7 @@ def plan(
     from palpate_planning.motion.planner import NoPathError
 
     if out.suffix.lower() != ".png":
-        refuse(f"--out {out}: want the name of a .png file")
+        refuse(f"--out {out}: expected the name of a .png file")
     chosen = check_usable(scenario, settings, seed)
     try:
         with SteadyConsole(stderr=True).status("planning: about ten seconds"):

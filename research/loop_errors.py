@@ -300,7 +300,7 @@ def renewed(known: Iterable[LoopErrors], fitted: Iterable[LoopErrors]) -> list[L
         if before is not None and row.examinations < before.examinations:
             raise ValueError(
                 f"loop.yaml: the row {', '.join(_key(row))} is of {before.examinations} examinations, these are "
-                f"{row.examinations}: want at least as many; take the row out first if the loop has changed"
+                f"{row.examinations}: expected at least as many; take the row out first if the loop has changed"
             )
         rows[_key(row)] = row
     return [rows[key] for key in sorted(rows)]

@@ -115,7 +115,7 @@ def test_a_press_has_the_force_of_the_tissue_of_the_system(patient: palpate.Pati
         ({"speed": 0.0}, "speed = 0.0 m/s"),
         ({"hold": -1.0}, "hold = -1.0 s"),
         ({"xy": (5.0, 0.0)}, "off the body"),
-        ({"xy": (0.0, 0.0, 0.0)}, "want x and y"),
+        ({"xy": (0.0, 0.0, 0.0)}, "expected x and y"),
     ],
 )
 def test_an_unusable_press_is_refused(patient: palpate.Patient, given: dict[str, object], named: str) -> None:

@@ -208,7 +208,7 @@ def test_a_violation_is_published_on_diagnostics(meddled: tuple[RunResult, dict[
 def test_a_peer_with_another_definition_of_a_message_is_named(meddled: tuple[RunResult, dict[str, Any]]) -> None:
     (text,) = [text for text in meddled[0].trouble if "joint_states" in text]
     assert "topic joint_states: robot publishes sensor_msgs/msg/JointState" in text
-    assert "stranger wants geometry_msgs/msg/WrenchStamped" in text
+    assert "stranger expects geometry_msgs/msg/WrenchStamped" in text
 
 
 def test_the_first_diagnostics_include_services_that_joined_late(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,9 +60,9 @@ def test_a_search_is_repeatable_and_keeps_to_its_budget() -> None:
 
 def test_a_hand_refuses_what_is_out_of_reach() -> None:
     hand = surrogate(False)
-    with pytest.raises(ValueError, match=r"place = .* want one within"):
+    with pytest.raises(ValueError, match=r"place = .* expected"):
         hand.press(np.array((0.3, 0.0)), 0.01)
-    with pytest.raises(ValueError, match=r"depth = 0.1 m: want more than 0 and at most"):
+    with pytest.raises(ValueError, match=r"depth = 0.1 m: expected more than 0 and at most"):
         hand.press(np.zeros(2), 0.1)
 
 
@@ -124,7 +124,7 @@ def test_a_trajectory_is_reproduced() -> None:
 
 
 def test_unusable_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="hand = 'foot': want surrogate or patient"):
+    with pytest.raises(ValueError, match="hand = 'foot': expected surrogate or patient"):
         SearchEnv("foot")
     with pytest.raises(ValueError, match="presses = 0"):
         SearchEnv(presses=0)

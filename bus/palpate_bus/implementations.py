@@ -24,7 +24,7 @@ def create(role: str, choice: str, scenario: Any) -> Service:
             raise
         raise kind(role).failure(choice, error) from error
     if not isinstance(service, Service):
-        raise PluginError(f"services.{role} = {choice!r}: create() returned {service!r}, want a palpate_bus.service.Service")
+        raise PluginError(f"services.{role} = {choice!r}: create() returned {service!r}, expected a palpate_bus.service.Service")
     if service.role != role:
         raise PluginError(f"services.{role} = {choice!r}: makes a service of the role {service.role!r}")
     return service

@@ -211,10 +211,10 @@ def _unreadable(file: Path, path: Path) -> RecordingError:
         return RecordingError(f"{file}: is empty, so nothing was recorded")
     for begin, kind in ((b"SQLite format 3", "an SQLite bag"), (b"#ROSBAG", "a ROS 1 bag")):
         if head.startswith(begin):
-            return RecordingError(f"{file}: is {kind}, want MCAP; {_convert(path)}")
+            return RecordingError(f"{file}: is {kind}, expected MCAP; {_convert(path)}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         remedy = _convert(path) if path != file else f"run: zstd -d {shlex.quote(str(file))}"
-        return RecordingError(f"{file}: is compressed as a whole, want MCAP; {remedy}")
+        return RecordingError(f"{file}: is compressed as a whole, expected MCAP; {remedy}")
     if not head.startswith(b"\x89MCAP"):
         return RecordingError(f"{file}: is not an MCAP file: it begins with {head[:8]!r}")
     return RecordingError(f"{file}: is unfinished: still being written, cut off, or its recorder was killed; {_recover(path)}")
@@ -249,10 +249,10 @@ def _list_files(metadata: Path) -> tuple[Path, ...]:
             f"{metadata}: is not rosbag2's description of a recording ({reason}); give its .mcap file"
         ) from error
     if compression == "message":
-        raise RecordingError(f"{metadata}: compression_mode = message, want none or chunks of MCAP; {_convert(metadata.parent)}")
+        raise RecordingError(f"{metadata}: compression_mode = message, expected none or chunks; {_convert(metadata.parent)}")
     for name, file in zip(names, files, strict=True):
         if name.is_absolute() or ".." in name.parts or not file.is_file():
-            raise RecordingError(f"{metadata}: lists {name}; want files that are in its folder")
+            raise RecordingError(f"{metadata}: lists {name}; expected files that are in its folder")
     if not files:
         raise RecordingError(f"{metadata}: lists no file")
     return files

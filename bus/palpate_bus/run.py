@@ -67,7 +67,7 @@ def load_service(role: str, load: Callable[[str], Any], words: Sequence[str] = (
 
     Raises BusConfigError, PluginError.
     """
-    scenario = load(str(Settings.read().require("scenario", "want a scenario file, as `palpate prepare` writes it")))
+    scenario = load(str(Settings.read().require("scenario", "expected a scenario file, as `palpate prepare` writes it")))
     return create(role, words[0] if words else getattr(scenario.services, role, "default"), scenario)
 
 

@@ -92,7 +92,7 @@ class InputFile(io.BufferedReader):
         mode = os.fstat(raw.fileno()).st_mode
         if not stat.S_ISREG(mode):
             raw.close()
-            raise error(f"{path}: is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; want a regular file")
+            raise error(f"{path}: is a {_KINDS.get(stat.S_IFMT(mode), 'special file')}; expected a regular file")
         super().__init__(raw)
         self._max_bytes, self._error, self._path = bounds().file_mb * MB if max_bytes is None else max_bytes, error, path
 
@@ -223,7 +223,7 @@ def check_xml(content: _TextT, name: object, error: type[UserError] = InputError
     parser, depth = expat.ParserCreate(), 0
 
     def refuse(*_: object) -> None:
-        raise error(f"{name} has a document type; want none")
+        raise error(f"{name} has a document type; expected none")
 
     def begin(*_: object) -> None:
         nonlocal depth
@@ -256,9 +256,9 @@ def check_archive(archive: _ArchiveT, name: object, error: type[UserError] = Inp
     for info in infos:
         path = PurePosixPath(info.orig_filename)
         if path.is_absolute() or ".." in path.parts or re.search(r"[\x00-\x1f\\:]", info.orig_filename):
-            raise error(f"{name}: has the file {info.orig_filename!r}; want relative names with forward slashes")
+            raise error(f"{name}: has the file {info.orig_filename!r}; expected relative names with forward slashes")
         if stat.S_IFMT(info.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise error(f"{name}: its file {info.filename!r} is a link or a device; want regular files")
+            raise error(f"{name}: its file {info.filename!r} is a link or a device; expected regular files")
     return archive
 
 

@@ -63,7 +63,7 @@ class PluginKind(NamedTuple):
         near = get_close_matches(choice, self.names(), n=1)
         suggestion = f". Did you mean {near[0]}?" if near else ""
         file = f"the path of a Python file that has {self.function}({self.arguments})"
-        return f"want one of {', '.join(self.names()) or 'none installed'}, or {file}{suggestion}"
+        return f"expected one of {', '.join(self.names()) or 'none installed'}, or {file}{suggestion}"
 
     def check(self, choice: str) -> None:
         """Check that the function exists. Imports nothing."""

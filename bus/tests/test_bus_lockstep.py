@@ -121,7 +121,7 @@ def test_what_is_no_outbox_is_named(returned: object) -> None:
     for method, call in (("step", lambda stepper: stepper.step(0)), ("start", lambda stepper: stepper.start())):
         toy = TOYS["robot"]()
         setattr(toy, method, lambda *_: returned)
-        with pytest.raises(LockstepError, match=f"robot returned {type(returned).__name__}; want an outbox"):
+        with pytest.raises(LockstepError, match=f"robot returned {type(returned).__name__}; expected an outbox"):
             call(Stepper(toy, contract()))
 
 

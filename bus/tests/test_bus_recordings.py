@@ -211,7 +211,7 @@ def file(content: bytes) -> Callable[[Path], Path]:
         (two_files, r"2 files but no metadata\.yaml.*palpate_recorder\.recover"),
         (file(b""), "is empty"),
         (file(b"time,depth\n0,1\n" + bytes(99)), r"is not an MCAP file: it begins with b'time,dep'"),
-        (lambda folder: bag(folder, ["gone.mcap"]), "lists gone.mcap; want files that are in its folder"),
+        (lambda folder: bag(folder, ["gone.mcap"]), "lists gone.mcap; expected files that are in its folder"),
         (lambda folder: bag(folder, []), "lists no file"),
         (lambda folder: folder / "nothing", "no recording there"),
     ],

@@ -69,7 +69,7 @@ def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
     for count, (name, record) in enumerate(_records(files, topics)):
         if record.log_time < past:
             late = f"{name} of {record.log_time / NS:.3f} s stands after {past / NS + DISORDER_MAX_NS / NS:.3f} s"
-            raise RecordingError(f"{files[0].parent}: {late} (want at most {DISORDER_MAX_NS / NS:g} s of disorder)")
+            raise RecordingError(f"{files[0].parent}: {late} (expected at most {DISORDER_MAX_NS / NS:g} s of disorder)")
         heappush(waiting, (record.log_time, count, name, record.data))
         while waiting[0][0] < record.log_time - DISORDER_MAX_NS:
             past, _, topic, payload = heappop(waiting)

@@ -46,11 +46,11 @@ class Live(NamedTuple):
         if kind == "serve":
             at, _, port = rest.rpartition(":")
             if port and not (port.isdigit() and 1024 <= int(port) <= 65534):
-                raise ValueError(f"PALPATE_VIEWER={text}: want serve:PORT or serve:ADDRESS:PORT with PORT in 1024..65534")
+                raise ValueError(f"PALPATE_VIEWER={text}: expected serve:PORT or serve:ADDRESS:PORT with PORT in 1024..65534")
             return Live(serve_port=int(port or 9876), serve_at=at or Live().serve_at)
         if kind == "connect":
             return Live(connect_url=rest or "rerun+http://127.0.0.1:9876/proxy")
-        raise ValueError(f"PALPATE_VIEWER={text}: want serve, serve:PORT, connect or connect:URL")
+        raise ValueError(f"PALPATE_VIEWER={text}: expected serve, serve:PORT, connect or connect:URL")
 
 
 def address(port: int) -> str:

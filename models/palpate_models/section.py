@@ -31,7 +31,7 @@ _T = TypeVar("_T")
 
 def _check_order(ends: tuple[Any, Any]) -> tuple[Any, Any]:
     if ends[0] > ends[1]:
-        raise ValueError("want the smaller value first")
+        raise ValueError("expected the smaller value first")
     return ends
 
 

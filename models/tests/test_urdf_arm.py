@@ -88,7 +88,7 @@ BROKEN = {
     "empty range": ({"limit": '<limit lower="1" upper="1" velocity="2" effort="80"/>'}, "joint joint_3: its range"),
     "range within the margins": (
         {"limit": '<limit lower="-0.05" upper="0.05" velocity="2" effort="80"/>'},
-        "joint joint_3: its range is -0.05 to 0.05 rad, want more than 0.1 rad",
+        "joint joint_3: its range is -0.05 to 0.05 rad, expected more than 0.1 rad",
     ),
     "no speed": ({"limit": '<limit lower="-1" upper="1" velocity="0" effort="80"/>'}, "joint joint_3: velocity_radps is 0"),
     "no torque": ({"limit": '<limit lower="-1" upper="1" velocity="2" effort="0"/>'}, "joint joint_3: torque_nm is 0"),
@@ -108,7 +108,7 @@ BROKEN = {
     "joint without name": ({"swap": ('joint name="joint_3"', "joint")}, "joint ''"),
     "mimic": ({"limit": '<mimic joint="joint_2"/>'}, "joint joint_3: mimics"),
     "axis": ({"swap": ('"0 0 2"', '"0 0 0"')}, "joint joint_1: its axis is zero"),
-    "axis without z": ({"swap": ('"0 0 2"', '"0 1"')}, "joint joint_1: xyz is '0 1', want 3"),
+    "axis without z": ({"swap": ('"0 0 2"', '"0 1"')}, "joint joint_1: xyz is '0 1', expected 3"),
     "origin": ({"swap": ("0.02 0 0.2", "nan 0 0.2")}, "joint joint_1: xyz is not finite"),
     "millimetres": ({"swap": ("0.02 0 0.2", "20 0 200")}, "joint joint_1: its origin is farther than 2 m"),
     "centre of mass": ({"swap": ("0 0 0.05", "0 0 50")}, "link link_1: its centre of mass is farther than 2 m"),
@@ -124,7 +124,7 @@ BROKEN = {
         {"collision": '<geometry><mesh filename="arm.urdf"/></geometry>'},
         "link link_3: mesh arm.urdf cannot be read",
     ),
-    "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, want 6"),
+    "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, expected 6"),
 }
 
 

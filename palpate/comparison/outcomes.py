@@ -49,13 +49,13 @@ def read_outcomes(path: Path) -> tuple[Array, Array, Array]:
     rows = read_table(path)
     lacking = [name for name in COLUMNS if name not in rows]
     if lacking:
-        raise UserError(f"{path}: lacks the column {lacking[0]}; want {', '.join(COLUMNS)}")
+        raise UserError(f"{path}: lacks the column {lacking[0]}; expected {', '.join(COLUMNS)}")
     try:
         real, simulated = (rows[name].to_numpy(float) for name in COLUMNS[1:])
     except ValueError as error:
-        raise UserError(f"{path}: {error}; want numbers in the columns real and simulated") from None
+        raise UserError(f"{path}: {error}; expected numbers in the columns real and simulated") from None
     if not np.isfinite(simulated).all():
-        raise UserError(f"{path}: column simulated has gaps; want a number for each body")
+        raise UserError(f"{path}: column simulated has gaps; expected a number for each body")
     paired = np.isfinite(real)
     if paired.sum() < MIN_PAIRS:
         raise UserError(f"{path}: {paired.sum()} bodies with real and simulated; at least {MIN_PAIRS} are needed")

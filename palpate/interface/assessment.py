@@ -159,10 +159,10 @@ def assess(touches: Touch | Iterable[Touch] | PalpationRecording) -> Assessment:
         return _assessment(collect_assessed(touches), {})
     felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
     if not felt:
-        raise ValueError("touches: there are none; want the results of Patient.press and Patient.slide")
+        raise ValueError("touches: there are none; expected the results of Patient.press and Patient.slide")
     seen = felt[0].seen
     if any(touch.seen is not seen for touch in felt):
-        raise ValueError("touches: they are of several patients; want touches of one patient")
+        raise ValueError("touches: they are of several patients; expected touches of one patient")
     gathered = _gather(seen, felt)
 
     def work() -> tuple[Collected, dict[str, Any]]:

@@ -99,7 +99,7 @@ def study(
     >>> result.cases.groupby("population").size()  # doctest: +SKIP
     """
     if split not in get_args(Split):
-        raise StudyError(f"split = {split!r}: want one of {', '.join(get_args(Split))}")
+        raise StudyError(f"split = {split!r}: expected one of {', '.join(get_args(Split))}")
     chosen = with_methods(load_study(str(source)), methods)
     request = Request(split, number, as_settings(dict(paths(settings))))
     cases = cases_of(chosen, request)

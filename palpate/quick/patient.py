@@ -96,7 +96,7 @@ class Patient:
         if tissue is None:
             raise NoTissueError(
                 f"{scenario.name}: services.tissue = {scenario.services.tissue!r} cannot be pressed without a run; "
-                "want one of winkler, elastic, fmu, or a file whose service is a TissueService"
+                "expected one of winkler, elastic, fmu, or a file whose service is a TissueService"
             )
         self.scenario = scenario
         self.tissue = tissue.in_steps_of(PERIOD_S)
@@ -144,7 +144,7 @@ class Patient:
         """
         self._within_limits(depth, speed)
         if not 0 <= hold <= _LONGEST_HOLD_S:
-            raise ValueError(f"hold = {hold} s: want 0 to {_LONGEST_HOLD_S:g} s")
+            raise ValueError(f"hold = {hold} s: expected 0 to {_LONGEST_HOLD_S:g} s")
         down = _ramp(0.0, depth, speed)
         depths = np.concatenate((down, np.full(round(hold / PERIOD_S), depth)))
         return self._touch(np.tile(_corners([xy], "xy"), (len(depths), 1)), depths, len(down))
@@ -213,14 +213,14 @@ class Patient:
         limits = self.scenario.limits
         for name, value, high, unit in (("depth", depth, limits.depth_m, "m"), ("speed", speed, limits.contact_speed_mps, "m/s")):
             if not 0 < value <= high:
-                raise ValueError(f"{name} = {value} {unit}: want more than 0 and at most {high:g} {unit} (the scenario's limits)")
+                raise ValueError(f"{name} = {value} {unit}: expected above 0, at most {high:g} {unit} (limits of the scenario)")
 
     def _touch(self, xy: Array, depths: Array, descent: int) -> Touch:
         """`descent`: number of instants of the descent."""
         places, normals = self.surface.points(xy)
         off = ~np.isfinite(places).all(axis=1)
         if off.any():
-            raise ValueError(f"({xy[off][0, 0]:g}, {xy[off][0, 1]:g}) m is off the body: want metres from the umbilicus")
+            raise ValueError(f"({xy[off][0, 0]:g}, {xy[off][0, 1]:g}) m is off the body: expected metres from the umbilicus")
         shares = self._follows(xy)
         times, force, lifted = np.empty(len(xy)), np.empty(len(xy)), np.empty(len(xy))
         for k, (place, normal, depth, share) in enumerate(zip(places, normals, depths, shares, strict=True)):
@@ -257,7 +257,7 @@ def _corners(path: Sequence[Sequence[float] | Array] | Array, name: str) -> Arra
     """Return places [m], shape (k, 2), k at least 1."""
     corners = np.asarray(path, dtype=float)
     if corners.ndim != 2 or corners.shape[1:] != (2,) or not np.isfinite(corners).all() or not len(corners):
-        raise ValueError(f"{name} = {path}: want x and y [m] in the abdomen frame for each place")
+        raise ValueError(f"{name} = {path}: expected x and y [m] in the abdomen frame for each place")
     return corners
 
 

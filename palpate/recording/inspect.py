@@ -203,7 +203,7 @@ def _frames(bag: Any) -> tuple[list[str], list[str]]:
 def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapping, Axis]:
     """Return the mapping with axes, sign, weight and delay of the force as the data say, and the pressing axis."""
     if len(raw.position) < LIMITS.rows:
-        raise ReadingError(f"{len(raw.position)} usable rows; want at least {LIMITS.rows}")
+        raise ReadingError(f"{len(raw.position)} usable rows; expected at least {LIMITS.rows}")
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
         candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})

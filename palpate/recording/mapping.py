@@ -51,7 +51,7 @@ class MappedColumns(Section):
     @model_validator(mode="after")
     def _check_order(self) -> MappedColumns:
         if (self.time is None) == (self.probe is None):
-            raise ValueError("want one of time and probe")
+            raise ValueError("expected one of time and probe")
         return self
 
 
@@ -153,7 +153,7 @@ class Mapping(Section):
     @model_validator(mode="after")
     def _one_source(self) -> Mapping:
         if (self.table is None) == (self.topics is None):
-            raise ValueError("want one of table and topics")
+            raise ValueError("expected one of table and topics")
         return self
 
 

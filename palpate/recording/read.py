@@ -352,7 +352,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     readings, faults = clean_readings(raw, mapping.tool.radius_m)
     readings = move_to_mapped(readings, mapping)
     if len(readings.position) < LIMITS.rows:
-        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LIMITS.rows}")
+        raise ReadingError(f"{name}: {len(readings.position)} usable rows; expected at least {LIMITS.rows}")
     faults += _implausible(readings)
     if is_refused(faults):
         return _without_contacts(name, mapping, faults)

@@ -178,7 +178,7 @@ def _turn(quaternion: Array, name: str) -> Rotation | None:
     if not norm.any():
         return None
     if not 0.9 < (usual := float(np.median(norm[norm > 0]))) < 1.1:
-        raise ReadingError(f"{name}: its norm is {usual:.3g}; want a quaternion, whose norm is 1")
+        raise ReadingError(f"{name}: its norm is {usual:.3g}; expected a quaternion, whose norm is 1")
     return Rotation.from_quat(np.where(norm[:, None] > 0, quaternion, (0.0, 0.0, 0.0, 1.0)))
 
 
@@ -194,7 +194,7 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     times, force = _average(rows[:, [int(repeats), 2, 3, 4]])
     stamps, first = np.unique(clocks[:, int(repeats)], return_index=True)
     if len(stamps) < 2:
-        raise ReadingError(f"{path}: {len(stamps)} poses; want at least 2")
+        raise ReadingError(f"{path}: {len(stamps)} poses; expected at least 2")
     inside = (times >= stamps[0]) & (times <= stamps[-1])
     if not inside.any():
         raise ReadingError(
@@ -315,7 +315,7 @@ def move_to_mapped(readings: Readings, mapping: Mapping) -> Readings:
     if force.shape[1] == 3:
         if mapping.force.axes == "tool":
             if turn is None:
-                raise ReadingError("force.axes = tool: the recording has no orientation; want `recording`, or table.orientation")
+                raise ReadingError("force.axes = tool: the recording has no orientation; expected recording or table.orientation")
             force = (turn * Rotation.from_euler("xyz", mapping.force.rpy_rad)).apply(force)
         force = (force if mapping.force.on == "tool" else -force) - mapping.tool.mass_kg * np.array(mapping.gravity_mps2)
     if any(mapping.tool.offset_m):

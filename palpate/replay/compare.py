@@ -209,9 +209,9 @@ def parse_tolerance(options: list[str]) -> Tolerance:
         try:
             value = float(number)
         except ValueError:
-            raise PluginError(f"--tolerance {option}: want a number, or TOPIC:FIELD=NUMBER") from None
+            raise PluginError(f"--tolerance {option}: expected a number, or TOPIC:FIELD=NUMBER") from None
         if not value >= 0:
-            raise PluginError(f"--tolerance {option}: want at least 0")
+            raise PluginError(f"--tolerance {option}: expected at least 0")
         if not name:
             relative = value
             continue

@@ -57,7 +57,7 @@ def write_page(folder: Path) -> Path:
     report, evidence = read_report(folder), read_evidence(folder)
     if report.run != evidence.run:
         raise EvidenceError(
-            f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of the run {evidence.run}; want files of one run"
+            f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of the run {evidence.run}; expected files of one run"
         )
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))

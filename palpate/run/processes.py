@@ -54,7 +54,7 @@ class SecureBus:
         certificate = read(self.keys / role / "cert.pem")
         if certificate.expired or certificate.name != role:
             found = f"is of {certificate.name!r}, valid until {certificate.until:%Y-%m-%d}"
-            wanted = f"want a valid one of {role!r}: palpate keys init {self.keys}"
+            wanted = f"expected a valid one of {role!r}: palpate keys init {self.keys}"
             raise BusConfigError(f"{certificate.path}: {found}; {wanted}")
         return options
 
@@ -139,7 +139,7 @@ def _services(path: Path) -> dict[str, Any]:
 
 def _mapping(value: Any, name: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise UserError(f"{name} = {value!r}: want a mapping")
+        raise UserError(f"{name} = {value!r}: expected a mapping")
     return value
 
 
@@ -147,7 +147,7 @@ def _merge(path: Path, role: str, service: Any, earlier: ServiceProcess) -> Serv
     name = f"{path}: services.{role}"
     command = _mapping(service, name).get("command", list(earlier.command))
     if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
-        raise UserError(f"{name}.command = {command!r}: want a list of words")
+        raise UserError(f"{name}.command = {command!r}: expected a list of words")
     environment = _mapping(service.get("environment") or {}, f"{name}.environment")
     return ServiceProcess(role, tuple(command), {**earlier.environment, **{k: str(v) for k, v in environment.items()}})
 

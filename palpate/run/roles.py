@@ -53,7 +53,7 @@ def settings_of(options: Sequence[str]) -> list[str]:
         role, equals, name = option.partition("=")
         if not equals or role not in _ROLES:
             roles = f"{', '.join(_ROLES)}{did_you_mean(role, _ROLES)}"
-            raise PluginError(f"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of {roles}")
+            raise PluginError(f"--service {option}: expected ROLE=NAME_OR_FILE with ROLE one of {roles}")
         settings.append(f"services.{role}={json.dumps(name)}")
     return settings
 

@@ -61,9 +61,9 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         `left`, the share of remaining presses. With maps it has `maps`, the posterior per place (`palpate_search.posterior`).
         """
         if hand not in ("surrogate", "patient"):
-            raise ValueError(f"hand = {hand!r}: want surrogate or patient")
+            raise ValueError(f"hand = {hand!r}: expected surrogate or patient")
         if not 1 <= presses <= 100 or not 1 <= patients <= 1000:
-            raise ValueError(f"presses = {presses}, patients = {patients}: want 1 to 100, 1 to 1000")
+            raise ValueError(f"presses = {presses}, patients = {patients}: expected 1 to 100, 1 to 1000")
         self._kind, self._presses, self._patients, self._maps = hand, presses, patients, maps
         self._begin(_cases(0))
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)

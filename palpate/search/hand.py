@@ -63,9 +63,9 @@ class _Timed:
     def _begin(self, xy: Array, depth: float) -> float:
         """Check and count a press; return its duration [s]."""
         if not np.all((xy >= self.task.low - 1e-9) & (xy <= self.task.high + 1e-9)):
-            raise ValueError(f"place = {xy.tolist()} m: want one within {self.task.low.tolist()} to {self.task.high.tolist()} m")
+            raise ValueError(f"place = {xy.tolist()} m: expected {self.task.low.tolist()} to {self.task.high.tolist()} m")
         if not 0 < depth <= self.task.deepest + 1e-9:
-            raise ValueError(f"depth = {depth} m: want more than 0 and at most {self.task.deepest} m")
+            raise ValueError(f"depth = {depth} m: expected more than 0 and at most {self.task.deepest} m")
         duration = float(press_duration(self._here, xy))
         self.spent += duration
         self._here, self._strokes = xy, self._strokes + 1

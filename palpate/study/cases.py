@@ -117,7 +117,7 @@ def cases_of(study: Study, request: Request = Request()) -> list[Case]:  # noqa:
         if twin is not case:
             raise StudyError(f"{study.name}: {case.label} and {twin.label} are the same examination: remove one of them")
     if not found:
-        raise StudyError(f"{study.name}: no patient in the split {request.split}: want populations.*.number.{request.split} >= 1")
+        raise StudyError(f"{study.name}: no patient in split {request.split}: expected populations.*.number.{request.split} >= 1")
     return list(found.values())
 
 
@@ -129,9 +129,9 @@ def secret_of(path: Path, study: Study) -> str:
         raise StudyError(f"--seeds-file {path}: {error.strerror}") from error
     digest = hashlib.sha256(content).hexdigest()
     if study.seeds_sha256 not in (None, digest):
-        raise StudyError(f"--seeds-file {path}: its SHA-256 is {digest}; {study.name} wants {study.seeds_sha256}")
+        raise StudyError(f"--seeds-file {path}: its SHA-256 is {digest}; {study.name} expects {study.seeds_sha256}")
     if not content.strip():
-        raise StudyError(f"--seeds-file {path}: is empty; want a secret of any kind, such as 32 random bytes")
+        raise StudyError(f"--seeds-file {path}: is empty; expected a secret of any kind, such as 32 random bytes")
     return content.hex()
 
 

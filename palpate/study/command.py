@@ -95,7 +95,7 @@ def run(  # noqa: PLR0913 - the options of a command
       palpate study release --shard 2/5 -o part2              the second of five parts; then: palpate study merge part*
     """
     if split not in SPLITS:
-        raise typer.BadParameter(f"--split {split}: want one of {', '.join(SPLITS)}")
+        raise typer.BadParameter(f"--split {split}: expected one of {', '.join(SPLITS)}")
     if shard and scheduler:
         refuse("--shard and --scheduler cannot be combined")
     from palpate.study.cases import Request, cases_of, command_of, secret_of
@@ -151,7 +151,7 @@ def scenario_of_case(
         outcome = Outcome.model_validate_json(case.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not an outcome of this version"
-        refuse(f"{case} is not a case of a study ({reason}): want a file such as out/study/NAME-SPLIT/cases/ID.json")
+        refuse(f"{case} is not a case of a study ({reason}): expected a file such as out/study/NAME-SPLIT/cases/ID.json")
     print(dump_scenario(Scenario.model_validate(outcome.case.scenario)), end="")
 
 

@@ -204,7 +204,7 @@ class Folder:
             if not case_id == outcome.case.case_id == outcome.case.content_id:
                 raise ValueError(f"it has the case {outcome.case.case_id}, whose content has the id {outcome.case.content_id}")
             if outcome.status == "done" and not outcome.code:
-                raise ValueError("code is empty: want the SHA-256 of the code that made it")
+                raise ValueError("code is empty: expected the SHA-256 of the code that made it")
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError) as error:

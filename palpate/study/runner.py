@@ -244,7 +244,7 @@ def select_shard(cases: Sequence[Case], shard: str) -> list[Case]:
     """Return every n-th case from the i-th, for a shard `i/n`. Raises StudyError."""
     match = re.fullmatch(r"(\d+)/(\d+)", shard)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise StudyError(f"--shard {shard}: want i/n with 1 <= i <= n, such as 2/5")
+        raise StudyError(f"--shard {shard}: expected i/n with 1 <= i <= n, such as 2/5")
     return list(cases[int(match[1]) - 1 :: int(match[2])])
 
 

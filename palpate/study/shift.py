@@ -42,7 +42,7 @@ def shift_patient(scenario: Scenario, family: Family, number: int) -> Settings:
     Raises UserError for a scenario of another kind.
     """
     if scenario.phantom.anatomy is None:
-        raise UserError(f"phantom.kind = {scenario.phantom.kind}: the split shift changes persons; want person")
+        raise UserError(f"phantom.kind = {scenario.phantom.kind}: the split shift changes persons; expected person")
     variants = list(FAMILIES[family].values())
     change = variants[number % len(variants)]
     return change(scenario.phantom, scenario.phantom.anatomy, generator(scenario.seed, f"shift {family}"))

@@ -116,7 +116,7 @@ class Method(Section):
         known = (*WORKERS, *OBSERVERS)
         for field, roles in (("services", self.services), ("periods", self.periods)):
             if wrong := [role for role in roles if role not in known]:
-                raise ValueError(f"{field}.{wrong[0]}: want one of {', '.join(known)}")
+                raise ValueError(f"{field}.{wrong[0]}: expected one of {', '.join(known)}")
         return self
 
 
@@ -147,7 +147,7 @@ class Study(Section):
             )
         allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
         if wrong := [name for name in self.each_error if name not in allowed]:
-            raise ValueError(f"each_error = {wrong[0]!r}: want one of {', '.join(allowed)}")
+            raise ValueError(f"each_error = {wrong[0]!r}: expected one of {', '.join(allowed)}")
         if self.tier == "quick" and any(method.runtime == "wallclock" or method.periods for method in self.methods.values()):
             raise ValueError("runtime: wallclock and periods of a method need tier: whole")
         return self
@@ -187,7 +187,7 @@ def load_study(source: str) -> Study:
     text = read_text(path, StudyError)
     raw = parse_yaml(text, source, StudyError)
     if not isinstance(raw, Mapping):
-        raise StudyError(f"{source}: want a mapping of fields, not {type(raw).__name__}")
+        raise StudyError(f"{source}: expected a mapping of fields, not {type(raw).__name__}")
     try:
         study = Study.model_validate({"name": path.stem, **raw})
     except ValidationError as error:
@@ -203,7 +203,7 @@ def load_study(source: str) -> Study:
 def with_methods(study: Study, only: Sequence[str] | None) -> Study:
     """Return the study with only these methods, or with all. Raises StudyError for an unknown one."""
     if wrong := [name for name in only or () if name not in study.methods]:
-        raise StudyError(f"{study.name}: there is no method {wrong[0]!r}: want one of {', '.join(study.methods)}")
+        raise StudyError(f"{study.name}: there is no method {wrong[0]!r}: expected one of {', '.join(study.methods)}")
     return study.model_copy(update={"methods": {name: own for name, own in study.methods.items() if not only or name in only}})
 
 

@@ -53,7 +53,7 @@ def main(
 ) -> None:
     """Search the patients of some seeds by every policy. `python -m research.search.curves` compares what was done."""
     if hand not in HANDS:
-        raise typer.BadParameter(f"--hand {hand}: want one of {', '.join(HANDS)}")
+        raise typer.BadParameter(f"--hand {hand}: expected one of {', '.join(HANDS)}")
     run(range(first_seed, first_seed + number * every, every), hand, names or POLICY.names(), out)
 
 

@@ -20,7 +20,7 @@ from palpate_validation.population import DEPTHS_M, sample_of
 
 
 def assert_bounds(section: PageSection) -> None:
-    missed = [f"{c.name}: {c.measured} {c.unit}, want {c.bound}" for c in section.checks if c.passed is False]
+    missed = [f"{c.name}: {c.measured} {c.unit}, expected {c.bound}" for c in section.checks if c.passed is False]
     assert not missed
     assert any(c.passed for c in section.checks)
 

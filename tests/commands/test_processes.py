@@ -41,8 +41,8 @@ ROOT = Path(__file__).parents[2]
     ("text", "error"),
     [
         ("services: {}", "no service 'robot'"),
-        ("services: {robot: {command: python -m x}}", "services.robot.command = 'python -m x': want a list of words"),
-        ("services: {robot: {command: [a], environment: [B=1]}}", "services.robot.environment = ['B=1']: want a mapping"),
+        ("services: {robot: {command: python -m x}}", "services.robot.command = 'python -m x': expected a list of words"),
+        ("services: {robot: {command: [a], environment: [B=1]}}", "services.robot.environment = ['B=1']: expected a mapping"),
     ],
 )
 def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: str) -> None:
@@ -254,7 +254,7 @@ def test_a_process_that_joins_is_given_command_and_environment(tmp_path: Path) -
 def test_implementations_of_a_place(tmp_path: Path) -> None:
     assert command_for("control", PLACE, None) == COMMAND
     assert command_for("control", PLACE, "default") == (*COMMAND, "default")
-    with pytest.raises(PluginError, match=r"services\.robot = 'bullet': want one of dart"):
+    with pytest.raises(PluginError, match=r"services\.robot = 'bullet': expected one of dart"):
         command_for("robot", PLACE, "bullet")
     with pytest.raises(PluginError, match="no such file"):
         command_for("robot", PLACE, str(tmp_path / "mine.py"))

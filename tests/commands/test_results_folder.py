@@ -114,7 +114,7 @@ def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
 
 @pytest.mark.parametrize("name", ["../../escape", "..", "a/b", "a\nb", "", "a" * 101])
 def test_a_scenario_cannot_place_its_results_elsewhere(name: str) -> None:
-    with pytest.raises(ValueError, match="want a file name"):
+    with pytest.raises(ValueError, match="expected a file name"):
         Scenario(name=name)
 
 
@@ -133,7 +133,7 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
         assert run in (one / name).read_text(encoding="utf-8"), name
     assert run in Image.open(one / "map.png").info["Comment"]
     shutil.copy(one / "evidence.mcap", two)
-    with pytest.raises(EvidenceError, match="want files of one run"):
+    with pytest.raises(EvidenceError, match="expected files of one run"):
         write_page(two)
 
 

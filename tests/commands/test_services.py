@@ -34,13 +34,13 @@ def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
 
 @pytest.mark.parametrize("option", ["assessment", "tisue=a.py", "conductor=a.py"])
 def test_an_unknown_role_is_named(option: str) -> None:
-    with pytest.raises(PluginError, match=rf"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
+    with pytest.raises(PluginError, match=rf"--service {option}: expected ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
         settings_of([option])
 
 
 def test_an_unknown_implementation_is_refused_with_the_allowed_ones() -> None:
     with pytest.raises(
-        PluginError, match=r"services\.robot = 'bullet': want one of dart, lbr, mujoco, ros2_control, or the path"
+        PluginError, match=r"services\.robot = 'bullet': expected one of dart, lbr, mujoco, ros2_control, or the path"
     ):
         chosen("robot=bullet")
     with pytest.raises(PluginError, match=r"services\.robot = 'none'"):
@@ -56,7 +56,7 @@ def test_an_unknown_implementation_is_refused_with_the_allowed_ones() -> None:
         ("x = 1", "no function create"),
         ("1 / 0\ndef create(scenario): ...", "line 1: ZeroDivisionError"),
         ("import math\ndef create(scenario):\n    return math.nosuch", "line 3: AttributeError"),
-        ("def create(scenario):\n    return 5", r"create\(\) returned 5, want a palpate_bus\.service\.Service"),
+        ("def create(scenario):\n    return 5", r"create\(\) returned 5, expected a palpate_bus\.service\.Service"),
     ],
 )
 def test_a_file_without_a_service_is_refused_with_its_line(tmp_path: Path, text: str | None, said: str) -> None:

@@ -132,7 +132,7 @@ def test_poses_without_an_orientation_are_positions(few: pd.DataFrame, tmp_path:
 def test_a_bag_without_messages_is_refused(few: pd.DataFrame, tmp_path: Path) -> None:
     write(tmp_path / "bag", few[:0], StoragePlugin.MCAP)
     mapping = Mapping.model_validate({"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL})
-    with pytest.raises(ReadingError, match="0 poses; want at least 2"):
+    with pytest.raises(ReadingError, match="0 poses; expected at least 2"):
         read_recording(tmp_path / "bag", mapping)
 
 

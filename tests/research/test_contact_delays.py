@@ -81,5 +81,7 @@ def test_an_arm_that_takes_positions_is_stable_with_any_delay(contrast: float, l
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_stability_under_delay_and_jitter() -> None:
-    missed = [f"{c.name}: {c.measured}, want {c.bound} ({c.against})" for c in stability.section().checks if c.passed is False]
+    missed = [
+        f"{c.name}: {c.measured}, expected {c.bound} ({c.against})" for c in stability.section().checks if c.passed is False
+    ]
     assert not missed

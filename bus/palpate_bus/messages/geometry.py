@@ -225,7 +225,7 @@ def depth_in_metres(name: str, message: Image) -> NDArray[np.float32]:
     Raises ValueError for an encoding that is not in `DEPTH_ENCODINGS`, or too little data. Its text begins with `name`.
     """
     if message.encoding not in DEPTH_ENCODINGS:
-        raise ValueError(f"{name}: encoding = {message.encoding!r}, want one of {', '.join(DEPTH_ENCODINGS)}")
+        raise ValueError(f"{name}: encoding = {message.encoding!r}, expected one of {', '.join(DEPTH_ENCODINGS)}")
     pixel, unit = DEPTH_ENCODINGS[message.encoding]
     kind = np.dtype((">" if message.is_bigendian else "<") + pixel)
     height, width, step = int(message.height), int(message.width), int(message.step)

@@ -130,10 +130,10 @@ def fit(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDA
     else:
         array = np.asarray(value)
         if not (np.can_cast(array.dtype, dtype, "same_kind") or array.size == 0):
-            raise ValueError(f"{field}: has {array.dtype}, wants {dtype}")
+            raise ValueError(f"{field}: has {array.dtype}, expected {dtype}")
         array = np.ascontiguousarray(array, dtype) if array.ndim else array
     if array.ndim != 1 or (length is not None and array.size != length):
-        raise ValueError(f"{field}: has shape {array.shape}, wants ({'n' if length is None else length},)")
+        raise ValueError(f"{field}: has shape {array.shape}, expected ({'n' if length is None else length},)")
     return array
 
 

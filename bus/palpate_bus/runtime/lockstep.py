@@ -372,7 +372,7 @@ class Stepper:
             return outbox.items()
         except AttributeError:
             kind = type(outbox).__name__
-            raise LockstepError(f"{self.role.name} returned {kind}; want an outbox: a dict of topics and messages") from None
+            raise LockstepError(f"{self.role.name} returned {kind}; expected an outbox: a dict of topics and messages") from None
 
     def _pack_outbox(self, outbox: Outbox, t: int) -> list[Outgoing]:
         sent: list[Outgoing] = []

@@ -214,7 +214,7 @@ def mismatches(entities: Iterable[Entity]) -> list[str]:
     publishers = [(node, end) for kind, node, end in endpoints if kind is EntityKind.PUBLISHER]
     subscriptions = [(node, end) for kind, node, end in endpoints if kind is EntityKind.SUBSCRIPTION]
     return sorted({
-        f"topic {sent.topic}: {sender} publishes {sent.type} {sent.type_hash}, but {reader} wants {wanted.type} "
+        f"topic {sent.topic}: {sender} publishes {sent.type} {sent.type_hash}, but {reader} expects {wanted.type} "
         f"{wanted.type_hash}; both need the same message definitions"
         for (sender, sent), (reader, wanted) in product(publishers, subscriptions)
         if sent.topic == wanted.topic and (sent.type, sent.type_hash) != (wanted.type, wanted.type_hash)

@@ -106,7 +106,7 @@ class BusOptions:
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
             if self.tls is not None and not endpoint.startswith("tls/"):
-                raise BusConfigError(f"PALPATE_TLS is {self.tls}, but {endpoint!r} is not encrypted; want tls/<host>:<port>")
+                raise BusConfigError(f"PALPATE_TLS is {self.tls}, but {endpoint!r} is not encrypted; expected tls/<host>:<port>")
         for name in TLS_FILES if self.tls is not None else ():
             if self.tls is not None and not (self.tls / name).is_file():
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")

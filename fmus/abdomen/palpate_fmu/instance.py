@@ -266,12 +266,12 @@ class FmuInstance:
         members = [self.variable(name) for name in names]
         kinds = {v.type for v in members}
         if len(kinds) != 1:
-            raise FmuError(f"{self.path.name}: {', '.join(names)}: want variables of one type, got {sorted(kinds)}")
+            raise FmuError(f"{self.path.name}: {', '.join(names)}: expected variables of one type, got {sorted(kinds)}")
         kind = kinds.pop()
         newer, older, dtype = _TYPES.get(kind, (None, None, np.float64))
         suffix = newer if self.version == 3 else older
         if suffix is None:
-            raise FmuError(f"{self.path.name}: {', '.join(names)}: of type {kind}; want {', '.join(_TYPES)}")
+            raise FmuError(f"{self.path.name}: {', '.join(names)}: of type {kind}; expected {', '.join(_TYPES)}")
         dtype = np.int32 if self.version == 2 and suffix in ("Integer", "Boolean") else dtype
         functions = {verb: self._function(f"{verb}{suffix}") for verb in ("Get", "Set")}
         component, check_status = self._component, self._check_status

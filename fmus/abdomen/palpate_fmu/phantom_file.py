@@ -30,7 +30,7 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
     Raises ExportError if it has more lesions or Prony branches than the FMU has room for, or a pulse.
     """
     if phantom.breathing.pulse_m:
-        raise ExportError(f"phantom.breathing.pulse_m = {phantom.breathing.pulse_m:g}: an FMU has no pulse, want 0")
+        raise ExportError(f"phantom.breathing.pulse_m = {phantom.breathing.pulse_m:g}: an FMU has no pulse, expected 0")
     material, lesions = phantom.stiffness, [at_skin(lesion) for lesion in phantom.lesions]
     if len(lesions) > LESIONS:
         raise ExportError(f"phantom.lesions has {len(lesions)} entries, an FMU has room for {LESIONS}")

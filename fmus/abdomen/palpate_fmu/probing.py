@@ -32,7 +32,7 @@ def run_and_plot(file: Path, out: Path) -> tuple[str, ...]:
     for name in names:
         if not np.isfinite(result[name]).all():
             k = int(np.flatnonzero(~np.isfinite(result[name]))[0])
-            raise FmuError(f"{file}: {name} is {result[name][k]} at {result['time'][k]:g} s: want finite numbers")
+            raise FmuError(f"{file}: {name} is {result[name][k]} at {result['time'][k]:g} s: expected finite numbers")
     figure = Figure(figsize=(8, 1 + 1.6 * min(len(names), 12)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(min(len(names), 12), 1, sharex=True))
     for axis, name in zip(axes, names, strict=False):

@@ -65,11 +65,11 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
         raise FmuError(f"{path}: not an FMU: the root of its {DESCRIPTION} is {root.tag}")
     version = root.get("fmiVersion", "")
     if not _VERSION.fullmatch(version):
-        raise FmuError(f"{path}: FMI {version or 'of no version'}; want 2.0 or 3.0")
+        raise FmuError(f"{path}: FMI {version or 'of no version'}; expected 2.0 or 3.0")
     for element in root:
         name = element.get("modelIdentifier")
         if name is not None and not (name.isascii() and name.isidentifier()):  # FMI: it names the library and its functions
-            raise FmuError(f"{path}: modelIdentifier = {brief(name)}: want an identifier of C")
+            raise FmuError(f"{path}: modelIdentifier = {brief(name)}: expected an identifier of C")
     starts = {variable.get("valueReference"): variable.get("start") for variable in root.iterfind("ModelVariables/*")}
     for variable in root.iterfind("ModelVariables/*[Dimension]"):
         for dimension in variable.iterfind("Dimension"):

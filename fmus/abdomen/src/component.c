@@ -244,7 +244,7 @@ int component_check(Component *c, const Slot *slot, const void *values) {
             value = integer;
         }
         if (!(value >= row->low && value <= row->high)) {
-            component_say(c, "%s[%lu] = %g is not allowed: want %g to %g", row->name,
+            component_say(c, "%s[%lu] = %g is not allowed: expected %g to %g", row->name,
                           (unsigned long)(slot->first + i + 1), value, row->low, row->high);
             return 0;
         }
@@ -333,7 +333,7 @@ int component_step(Component *c, double time, double dt) {
     const double now = c->tissue->state.time, periods = ceil(dt / PERIOD_S * (1 - 1e-9));
     if (!component_expects(c, c->phase == PHASE_STEP, "a step")) return 0;
     if (!(dt > 0) || dt > LONGEST_STEP_S) {
-        component_say(c, "a step of %g s is not possible: want more than 0 and at most %g s", dt, LONGEST_STEP_S);
+        component_say(c, "a step of %g s is not possible: expected more than 0 and at most %g s", dt, LONGEST_STEP_S);
         return 0;
     }
     if (!(fabs(time - now) <= STEP_TOLERANCE * dt + 1e-12 * fabs(now))) {

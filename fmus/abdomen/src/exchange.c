@@ -44,7 +44,7 @@ int exchange_set_states(Component *c, const double *values, size_t count) {
     if (!fits(c, is_running(c), count, "setting continuous states")) return 0;
     for (size_t i = 0; i < count; i++) {
         if (!(fabs(values[i]) <= LARGEST)) {
-            component_say(c, "continuous state %lu = %g is not allowed: want %g to %g", (unsigned long)i + 1, values[i], -LARGEST,
+            component_say(c, "continuous state %lu = %g is not allowed: expected %g to %g", (unsigned long)i + 1, values[i], -LARGEST,
                           LARGEST);
             return 0;
         }

@@ -185,7 +185,7 @@ FOREIGN = """<?xml version="1.0" encoding="UTF-8"?>
 
 @pytest.mark.parametrize(
     ("version", "status", "words"),
-    [("2.0", 0, ("platforms: linux64", "do not prevent its use", "touching")), ("1.0", 2, ("FMI 1.0; want 2.0 or 3.0",))],
+    [("2.0", 0, ("platforms: linux64", "do not prevent its use", "touching")), ("1.0", 2, ("FMI 1.0; expected 2.0 or 3.0",))],
 )
 def test_info_shows_what_a_strangers_fmu_is(version: str, status: int, words: tuple[str, ...], tmp_path: Path) -> None:
     path = tmp_path / "one.fmu"

@@ -152,7 +152,7 @@ def test_a_bad_value_is_refused_with_a_message_and_nothing_changes(
 
 @pytest.mark.parametrize(
     ("t", "dt", "word"),
-    [(0.1, 1e-3, "going back"), (0.5, 1e-3, "time reached"), (0.3, -1e-3, "want more than 0"), (0.3, np.nan, "nan"),
+    [(0.1, 1e-3, "going back"), (0.5, 1e-3, "time reached"), (0.3, -1e-3, "expected more than 0"), (0.3, np.nan, "nan"),
      (np.nan, 1e-3, "nan"), (0.3, 1e9, "at most 60")],
 )  # fmt: skip
 def test_an_impossible_step_is_refused_with_a_message_and_nothing_changes(fmu: Path, t: float, dt: float, word: str) -> None:

@@ -95,22 +95,22 @@ def read_grid(path: Path) -> BodyGrid:
     except (OSError, ValueError) as error:
         raise GridError(f"phantom.grid = {path}: cannot be read as CSV: {error}") from error
     if sorted(table.dtype.names or ()) != sorted(columns):
-        raise GridError(f"phantom.grid = {path}: has columns {', '.join(table.dtype.names or ())}; want {', '.join(columns)}")
+        raise GridError(f"phantom.grid = {path}: has columns {', '.join(table.dtype.names or ())}; expected {', '.join(columns)}")
     for name, (low, high) in _LIMITS.items():
         bad = ~((table[name] >= low) & (table[name] <= high))
         if bad.any():
             row = int(bad.argmax())
             raise GridError(
-                f"phantom.grid = {path}, row {row + 1}: {name} = {table[name][row]}: want a number from {low:g} to {high:g}"
+                f"phantom.grid = {path}, row {row + 1}: {name} = {table[name][row]}: expected a number from {low:g} to {high:g}"
             )
     axes = [np.unique(table[name]) for name in ("x_m", "y_m")]
     for name, axis in zip(("x_m", "y_m"), axes, strict=True):
         steps = np.diff(axis)
         if len(axis) < GRID.min_nodes or np.ptp(steps) > GRID.pitch_tolerance * steps.mean():
             raise GridError(
-                f"phantom.grid = {path}: {name} has {len(axis)} values; want {GRID.min_nodes} or more at equal distances"
+                f"phantom.grid = {path}: {name} has {len(axis)} values; expected {GRID.min_nodes} or more at equal distances"
             )
     table = table[np.lexsort((table["y_m"], table["x_m"]))]
     if len(np.unique(table[["x_m", "y_m"]])) != len(table) or len(table) != len(axes[0]) * len(axes[1]):
-        raise GridError(f"phantom.grid = {path}: {len(table)} rows; want one for each of {len(axes[0])} x {len(axes[1])} nodes")
+        raise GridError(f"phantom.grid = {path}: {len(table)} rows; expected {len(axes[0])} x {len(axes[1])}, one a node")
     return BodyGrid(**{name: table[name].copy() for name in columns})

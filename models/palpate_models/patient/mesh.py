@@ -86,7 +86,7 @@ def check(vertices: Array, triangles: IntArray) -> None:
     size = float(np.ptp(vertices, axis=0).max())
     if not LIMITS.smallest_m <= size <= LIMITS.largest_m:
         fitting = _fitting_units(vertices, triangles)
-        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; {fitting}")
+        raise MeshError(f"its size is {size:.4g}, expected {LIMITS.smallest_m} to {LIMITS.largest_m} metres; {fitting}")
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -145,17 +145,17 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     width, thickness = _across(vertices, triangles)
     if width > LIMITS.widest_m or thickness > LIMITS.thickest_m:
         raise MeshError(
-            f"at the umbilicus it is {width:.3g} m wide and {thickness:.3g} m thick, want up to {LIMITS.widest_m} and "
+            f"at the umbilicus it is {width:.3g} m wide and {thickness:.3g} m thick, expected up to {LIMITS.widest_m} and "
             f"{LIMITS.thickest_m} metres; {_fitting_units(vertices, triangles)}"
         )
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
     border = boundary_vertices(len(vertices), triangles)
     if normal[2] < LIMITS.min_normal_z:
-        raise MeshError(f"at the umbilicus the surface faces ({', '.join(f'{x:.2g}' for x in normal)}), want +z ({frame})")
+        raise MeshError(f"at the umbilicus the surface faces ({', '.join(f'{x:.2g}' for x in normal)}), expected +z ({frame})")
     if border.any() and vertices[border, 2].mean() > LIMITS.near_umbilicus_m:
         rise = vertices[border, 2].mean()
-        raise MeshError(f"its border lies {rise:.2g} m above the umbilicus, want it below: it seems to lie face down ({frame})")
+        raise MeshError(f"its border lies {rise:.2g} m above the umbilicus, expected below: it seems to lie face down ({frame})")
 
 
 def orient(vertices: Array, triangles: IntArray) -> IntArray:

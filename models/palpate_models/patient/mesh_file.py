@@ -40,7 +40,7 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL + 1)  # it logs tracebacks of files that are refused here
     if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"want a file in {', '.join(SUFFIXES)}")
+        raise MeshError(f"expected a file in {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise MeshError("no such file")
     content = read_bytes(path, MeshError)
@@ -109,7 +109,7 @@ def _check_ply(loaded: trimesh.Trimesh) -> None:
             raise MeshError(f"its header promises {promised} of {name}, {rows} are there: the file is not whole")
         short = [row for row in columns[0] if name == "face" and isinstance(row, list | np.ndarray) and len(row) < 3]
         if short:
-            raise MeshError(f"a face names {len(short[0])} vertices, want at least 3: the file is not whole")
+            raise MeshError(f"a face names {len(short[0])} vertices, expected at least 3: the file is not whole")
 
 
 def _check_stl(content: bytes, as_text: bool) -> None:
@@ -137,7 +137,7 @@ def _check_obj(content: str) -> None:
     for number, face in enumerate(faces):
         corners = [int(corner.split("/")[0]) for corner in face.split("#")[0].split()]
         if len(corners) < 3:
-            raise MeshError(f"face {number} names {len(corners)} vertices, want at least 3: the file is not whole")
+            raise MeshError(f"face {number} names {len(corners)} vertices, expected at least 3: the file is not whole")
         for corner in corners:
             if corner == 0 or abs(corner) > vertices:
                 raise MeshError(f"face {number} names vertex {corner}, the vertices are 1 to {vertices}")

@@ -114,7 +114,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         centre, radii = phantom.lesions[index].centre_m, phantom.lesions[index].radii_m
         raise MeshError(
             f"phantom.lesions[{index}]: centre_m {centre}, radii_m {radii}: no point of the abdomen's front belongs to it "
-            "(want metres from the umbilicus; a stiffer lesion may cover it; where it was drawn, a smaller phantom.draw.region_m)"
+            "(expected metres from the umbilicus; a stiffer lesion may cover it; if drawn, a smaller phantom.draw.region_m)"
         )
     tension = tension_field(vertices[:, :2], phantom.guarding, phantom.stiffness, front=normals[:, 2] > 0)
     return PhantomModel(

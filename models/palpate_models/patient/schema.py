@@ -16,7 +16,7 @@ from palpate_models.section import Ends, Length, NonNegative, Positive, Section,
 
 def _changing(factor: float) -> float:
     if factor == 1:
-        raise ValueError("1 changes nothing; want 0.1 to 20 and not 1")
+        raise ValueError("1 changes nothing; expected 0.1 to 20 and not 1")
     return factor
 
 
@@ -124,7 +124,7 @@ class Draw(Section):
     @model_validator(mode="after")
     def _either(self) -> Self:
         if self.contrast[0] <= 1 <= self.contrast[1]:
-            raise ValueError(f"contrast = {self.contrast[0]:g} to {self.contrast[1]:g}: want both above 1, or both below")
+            raise ValueError(f"contrast = {self.contrast[0]:g} to {self.contrast[1]:g}: expected both above 1, or both below")
         return self
 
 

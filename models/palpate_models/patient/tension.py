@@ -37,7 +37,7 @@ def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, fr
         if not share.any():
             raise MeshError(
                 f"phantom.guarding[{index}]: centre_m {area.centre_m}, radii_m {area.radii_m}: no point of the abdomen's front "
-                "belongs to it (want metres from the umbilicus)"
+                "belongs to it (expected metres from the umbilicus)"
             )
         np.maximum(tension, tension_of_ratio(area.ratio, stiffness) * share, out=tension)
     return tension

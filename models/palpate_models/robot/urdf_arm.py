@@ -109,7 +109,7 @@ class UrdfTree:
         if any("xacro" in element.tag for element in root.iter()):
             raise UserError(f"{path}: not a URDF: has xacro elements; expand it with the tool xacro")
         if root.tag != "robot":
-            raise UserError(f"{path}: not a URDF: its root element is {root.tag}, want robot")
+            raise UserError(f"{path}: not a URDF: its root element is {root.tag}, expected robot")
         self.links = {link.get("name", ""): link for link in root.findall("link")}
         self.joints = root.findall("joint")
         self.joint_of = {link_name(joint, "child"): joint for joint in self.joints}
@@ -138,7 +138,7 @@ class UrdfTree:
                 found.append(f"link {link_name(joint, 'child')}: has two joints above it, one is {joint.get('name')}")
         roots = [link for link in self.links if link not in self.joint_of]
         if len(roots) > 1 and not found:
-            found.append(f"links {', '.join(roots)}: {len(roots)} roots, want one")
+            found.append(f"links {', '.join(roots)}: {len(roots)} roots, expected one")
         return found
 
     def chain(self, flange: str) -> list[str]:
@@ -160,7 +160,7 @@ class UrdfTree:
         except ValueError:
             found = np.zeros(0)
         if len(found) != len(default.split()):
-            raise ValueError(f"{self.part}: {attribute} is {text!r}, want {len(default.split())} number(s)")
+            raise ValueError(f"{self.part}: {attribute} is {text!r}, expected {len(default.split())} number(s)")
         if not np.isfinite(found).all():
             raise ValueError(f"{self.part}: {attribute} is not finite: {text}")
         return found
@@ -201,7 +201,7 @@ class _Reader(UrdfTree):
         poses, moving = self._link_poses(chain)
         n = len(moving)
         if n not in (6, 7):
-            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]
+            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, expected 6 or 7 that turn"]
         lower, upper, velocity, torque = self._limits(moving)
         R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
@@ -213,7 +213,7 @@ class _Reader(UrdfTree):
             self.faults.append(f"links {chain[0]} to {self._given.flange}: none has a shape, so collisions cannot be seen")
         home = np.zeros(n) if self._given.home_rad is None else np.array(self._given.home_rad)
         if len(home) != n:
-            self.faults.append(f"home_rad: {len(home)} values, want {n}")
+            self.faults.append(f"home_rad: {len(home)} values, expected {n}")
         if self.faults:
             return None, self.faults
         axes = np.array([X[:3, :3] @ self._axis(joint) for X, joint in zip(frames[1:], moving, strict=True)])
@@ -269,13 +269,13 @@ class _Reader(UrdfTree):
             poses.append(X)
             kind = joint.get("type")
             if np.linalg.norm(self.numbers(joint.find("origin"), "xyz")) > TUNING.largest_link_m:
-                self.faults.append(f"{self.part}: its origin is farther than {TUNING.largest_link_m:g} m: want metres")
+                self.faults.append(f"{self.part}: its origin is farther than {TUNING.largest_link_m:g} m: expected metres")
             if joint.find("mimic") is not None:
-                self.faults.append(f"{self.part}: mimics another joint; want joints that turn by themselves")
+                self.faults.append(f"{self.part}: mimics another joint; expected joints that turn by themselves")
             if kind in ("revolute", "continuous"):
                 moving.append(joint)
             elif kind != "fixed":
-                raise ValueError(f"{self.part}: is {kind}; want joints that turn")
+                raise ValueError(f"{self.part}: is {kind}; expected joints that turn")
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> Array:
@@ -296,10 +296,10 @@ class _Reader(UrdfTree):
                     table[row, k] = self.numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
             if not upper - lower > (least := 2 * Limits().joint_margin_rad):
-                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad, want more than {least:g} rad")
+                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad, expected more than {least:g} rad")
             for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
                 if not value > 0:
-                    self.faults.append(f"joint {name}: {field} is {value:g}, want more than 0")
+                    self.faults.append(f"joint {name}: {field} is {value:g}, expected more than 0")
         return table
 
     def _rigid(self, chain: list[str], poses: dict[str, Array], moving: list[ElementTree.Element]) -> list[Group]:
@@ -344,7 +344,7 @@ class _Reader(UrdfTree):
             self._check_inertia(link, mass, tensor)
             offset = self.pose(inertial.find("origin"))
             if np.linalg.norm(offset[:3, 3]) > TUNING.largest_link_m:
-                self.faults.append(f"link {link}: its centre of mass is farther than {TUNING.largest_link_m:g} m: want metres")
+                self.faults.append(f"link {link}: its centre of mass is farther than {TUNING.largest_link_m:g} m: not metres")
             X_C = X @ offset
             parts.append((mass, X_C[:3, 3], X_C[:3, :3] @ tensor @ X_C[:3, :3].T))
         name, total = group[0][0], sum(mass for mass, _, _ in parts)
@@ -367,7 +367,7 @@ class _Reader(UrdfTree):
 
     def _check_inertia(self, link: str, mass: float, tensor: Array) -> None:
         if mass <= 0:
-            self.faults.append(f"link {link}: mass is {mass:g} kg, want more than 0")
+            self.faults.append(f"link {link}: mass is {mass:g} kg, expected more than 0")
         a, b, c = np.linalg.eigvalsh(tensor)
         if a < 0:
             self.faults.append(f"link {link}: inertia is not positive: a principal moment is {a:.3g} kg m^2")
@@ -410,9 +410,9 @@ class _Reader(UrdfTree):
             top = np.array((0.0, 0.0, half))
             points = np.concatenate((ring + top, ring - top, tips))
         else:
-            raise ValueError(f"{self.part}: shape {kind.tag}; want mesh, box, sphere or cylinder")
+            raise ValueError(f"{self.part}: shape {kind.tag}; expected mesh, box, sphere or cylinder")
         if not (size > 0).all():
-            raise ValueError(f"{self.part}: size of its {kind.tag} is {size}, want more than 0")
+            raise ValueError(f"{self.part}: size of its {kind.tag} is {size}, expected more than 0")
         return np.asarray(points @ X[:3, :3].T + X[:3, 3])
 
     def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:

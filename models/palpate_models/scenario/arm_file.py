@@ -74,7 +74,7 @@ def arm_path(name: str) -> Path:
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join((DEFAULT_ARM, *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
-        raise UserError(f"robot.arm: {name}: no such file; want {known}, or the path of a YAML file")
+        raise UserError(f"robot.arm: {name}: no such file; expected {known}, or the path of a YAML file")
     return path
 
 

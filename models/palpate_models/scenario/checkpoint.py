@@ -84,7 +84,7 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
         wanted |= {"left": (len(left), 2), "surface": (len(surface), 3), "strokes": ()}
         for name, array in {**held, "left": left, "surface": surface, "strokes": strokes}.items():
             if array.shape != wanted[name] or array.dtype.kind not in "bif" or not np.isfinite(array).all():
-                raise ValueError(f"{name}: want finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
+                raise ValueError(f"{name}: expected finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
         return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path}: not a checkpoint of this version: {error}") from error

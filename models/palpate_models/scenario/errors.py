@@ -187,7 +187,7 @@ class Errors(Section):
         if isinstance(given, str):
             given = {"level": given}
         if not isinstance(given, Mapping):
-            raise ValueError("want none, typical or poor, or a mapping with level and fields")
+            raise ValueError("expected none, typical or poor, or a mapping with level and fields")
         level = given.get("level", LEVEL)
         values = levels().get(level, {}) if isinstance(level, str) else {}
         merged = dict(given)

@@ -32,18 +32,18 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
     lines = []
     for item in error.errors()[:_EXPLAINED]:
         field = [str(part) for part in item["loc"]]
-        what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "want ")
+        what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "expected ")
         if item["type"] == "extra_forbidden":
             what = f"there is no such field{did_you_mean(field[-1], _fields(model.model_json_schema()))}"
         elif item["type"] in _NO_SECTION:
-            what = "want a section, a mapping of fields"
+            what = "expected a section, a mapping of fields"
         elif item["type"] == "missing":
             last = field.pop()
-            what = f"want at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
+            what = f"expected at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
         elif item["type"] == "tuple_type":
-            what = "want a list of values in square brackets"
+            what = "expected a list of values in square brackets"
         elif item["type"] == "too_long":
-            what = f"want at most {item['ctx']['max_length']} values"
+            what = f"expected at most {item['ctx']['max_length']} values"
         elif item["type"] in _NUMBERS and (unit := _unit(field)):
             what += f" (in {unit})"
         path = ".".join(field) or "scenario"
@@ -127,7 +127,7 @@ def _read(source: str) -> tuple[str, str]:
         return resources.files("palpate_models").joinpath("scenarios", name).read_text(encoding="utf-8"), name
     path = Path(source)
     if path.is_dir():
-        raise ScenarioError(f"{source}: is a folder; want a YAML file, such as the scenario.yaml of a run")
+        raise ScenarioError(f"{source}: is a folder; expected a YAML file, such as the scenario.yaml of a run")
     if path.suffix in (".yaml", ".yml") and not path.exists():
         raise ScenarioError(f"{source}: there is no such file")
     if not path.is_file():
@@ -142,7 +142,7 @@ def _override(raw: dict[str, Any], setting: str) -> None:
     """Apply one `a.b=c` to nested mappings; the value is YAML."""
     field, separator, value = setting.partition("=")
     if not separator or not field:
-        raise ScenarioError(f"--set {setting}: want field.path=value, e.g. exam.depth_m=0.008")
+        raise ScenarioError(f"--set {setting}: expected field.path=value, e.g. exam.depth_m=0.008")
     *parents, last = field.split(".")
     node: Any = raw
     for parent in parents:
@@ -164,7 +164,7 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
     text, name = _read(source)
     raw = parse_yaml(text, name, ScenarioError) or {}
     if not isinstance(raw, dict):
-        raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
+        raise ScenarioError(f"{name}: expected a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)
     phantom = raw.get("phantom")
     if isinstance(phantom, dict) and isinstance(phantom.get("grid"), str):
@@ -186,7 +186,7 @@ def as_settings(fields: Mapping[str, Any]) -> list[str]:
     try:
         return [f"{path}={json.dumps(value)}" for path, value in fields.items()]
     except (TypeError, ValueError) as error:
-        raise ScenarioError(f"{', '.join(fields)}: want numbers, words, lists and mappings: {error}") from error
+        raise ScenarioError(f"{', '.join(fields)}: expected numbers, words, lists and mappings: {error}") from error
 
 
 def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Scenario:

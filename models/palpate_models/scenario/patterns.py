@@ -58,14 +58,14 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
     except (Exception, SystemExit) as error:
         raise PATTERN.failure(exam.pattern, error) from error
     if not isinstance(made, Scan):
-        raise PluginError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, expected a Scan of {__name__}")
     lines = [np.asarray(line, dtype=np.float64) for line in made.lines]
     for k, line in enumerate(lines):
         if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():
-            raise PluginError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
+            raise PluginError(f"exam.pattern = {exam.pattern!r}: line {k} has shape {line.shape}, expected finite (k, 2), k > 0")
     count = sum(map(len, lines))
     if not 0 < count <= LIMITS.max_targets:
-        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LIMITS.max_targets}")
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, expected 1 to {LIMITS.max_targets}")
     scan = Scan(lines, made.joined)
     off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
     if off.max() > LIMITS.outside_m:

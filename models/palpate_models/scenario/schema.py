@@ -225,7 +225,7 @@ class Camera(Section):
     def _apart(self) -> Camera:
         if dist(self.position_m, self.look_at_m) < 0.1:
             raise ValueError(
-                f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: want at least 0.1 m between them"
+                f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: expected at least 0.1 m between them"
             )
         return self
 
@@ -263,7 +263,7 @@ class Limits(Section):
         for axis, low, high in zip("xyz", self.workspace_min_m, self.workspace_max_m, strict=True):
             if not -3 <= low < high <= 3:
                 raise ValueError(
-                    f"workspace_min_m and workspace_max_m: {axis} from {low:g} to {high:g} m; want -3 <= min < max <= 3"
+                    f"workspace_min_m and workspace_max_m: {axis} from {low:g} to {high:g} m; expected -3 <= min < max <= 3"
                 )
         return self
 
@@ -324,7 +324,7 @@ class Scenario(Section):
     def _one_file(cls, name: str) -> str:
         """Refuse a name that would place results in another folder."""
         if not re.fullmatch(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]{0,99}", name):
-            raise ValueError("want a file name of at most 100 characters, without / and \\ and no dot at its beginning")
+            raise ValueError("expected a file name of at most 100 characters, without / and \\ and no dot at its beginning")
         return name
 
     @field_validator("phantom")

@@ -98,7 +98,7 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
     if not doubled.empty:
         row = doubled.iloc[0]
         where = f"{row['population']}, {row['split']}, number {row['number']}"
-        raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): want one per patient")
+        raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): expected one per patient")
     facts = cases[["case_id", "patient", "failed"]]
     findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
     findings = findings[~findings["failed"]]

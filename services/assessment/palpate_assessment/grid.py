@@ -62,7 +62,7 @@ def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, flo
     near = surface[np.all(np.abs(surface[:, :2] - centre) <= half + 0.03, axis=1)]
     near = near[np.isfinite(near).all(axis=1)]
     if len(near) < 30:
-        raise ValueError(f"perceived surface: {len(near)} vertices in the examined region, want at least 30")
+        raise ValueError(f"perceived surface: {len(near)} vertices in the examined region, expected at least 30")
     shape = np.linalg.lstsq(_terms(near[:, 0], near[:, 1]), near[:, 2], rcond=None)[0]
     count = np.maximum(np.round(2 * half / pitch).astype(int) + 1, 3)
     x = centre[0] + (np.arange(count[0]) - 0.5 * (count[0] - 1)) * pitch

@@ -154,7 +154,7 @@ class AssessmentService(Service):
         """Take a `perception/surface`. Raises ValueError for one in another frame than the contract's."""
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
-            raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
+            raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, expected {wanted!r}")
         self._perceived, self._skin = message, None
         p_A = apply(self._X_AW, np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3))
         if self._surface is not None and self.samples:

@@ -78,19 +78,19 @@ class CameraInput(NamedTuple):
         K, name = (P[:, :3], "p") if self.rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
         if name == "k" and not np.all(np.abs(np.asarray(info.d)) <= LARGEST_DISTORTION):  # also true for NaN
             raise CameraError(
-                f"{self.info}: d = {np.asarray(info.d).tolist()}: want an image without distortion: rectify it "
+                f"{self.info}: d = {np.asarray(info.d).tolist()}: expected an image without distortion: rectify it "
                 f"(ros2 run image_proc rectify_node --ros-args -p interpolation:=0) and {self.distorted}"
             )
         width, height = int(info.width), int(info.height)
         parts = max(info.binning_x, info.binning_y) > 1 or (info.roi.width, info.roi.height) not in ((0, 0), (width, height))
         if parts:
-            raise CameraError(f"{self.info}: binning or a region of interest: want the intrinsics of the image as it is sent")
+            raise CameraError(f"{self.info}: binning or a region of interest: expected the intrinsics of the image as it is sent")
         fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         where = f"{self.info}: {name} = {K.ravel().tolist()}"
         if not (np.isfinite(K).all() and fx > 0 and fy > 0):
             raise CameraError(f"{where}: all must be finite, and the focal lengths positive")
         if not np.array_equal(K, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])):
-            raise CameraError(f"{where}: want fx, 0, cx, 0, fy, cy, 0, 0, 1")
+            raise CameraError(f"{where}: expected fx, 0, cx, 0, fy, cy, 0, 0, 1")
         sides = fx / width, fy / height
         if not (FOCAL[0] < min(sides) and max(sides) < FOCAL[1] and ASPECT[0] < fx / fy < ASPECT[1]):
             raise CameraError(f"{where}: focal lengths of {fx:g} and {fy:g} px are not of an image of {width} x {height} px")
@@ -102,11 +102,11 @@ class CameraInput(NamedTuple):
         """Raise CameraError if no image measures anything, or their depth is not that of a camera."""
         depth = np.concatenate([frame.depth[np.isfinite(frame.depth)] for frame in frames])
         if not len(depth):
-            raise CameraError(f"{self.image}: no pixel has a depth of 0 to {MAX_DEPTH_M:g} m: want 32FC1 in m or 16UC1 in mm")
+            raise CameraError(f"{self.image}: no pixel has a depth of 0 to {MAX_DEPTH_M:g} m: expected 32FC1 in m or 16UC1 in mm")
         low, high = USUAL_DEPTH_M
         if not low < (usual := float(np.median(depth))) < high:
             raise CameraError(
-                f"{self.image}: its median depth is {usual:.3g} m, want {low:g} to {high:g} m: see encoding, unit, is_bigendian"
+                f"{self.image}: median depth is {usual:.3g} m, expected {low:g} to {high:g} m: see encoding, unit, is_bigendian"
             )
 
 
@@ -157,7 +157,7 @@ class StaticTransforms:
 def _problem(parent: str, child: str, transform: Transform) -> str:
     """Describe what is wrong with a transform; empty if it is valid."""
     if not parent or not child or parent == child:
-        return f"it is from {parent!r} to {child!r}, want two frames"
+        return f"it is from {parent!r} to {child!r}, expected two frames"
     p = transform.translation
     if not all(map(isfinite, (p.x, p.y, p.z))):
         return f"translation = ({p.x}, {p.y}, {p.z}): must be finite"

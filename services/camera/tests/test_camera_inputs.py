@@ -119,8 +119,8 @@ def shown(service: Service) -> Any:
                 (1e7, 1e7, 3.5, 2.5),
             )
         ),
-        ("k", np.array([600.0, 3.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 1.0]), "k = .*want fx, 0, cx"),
-        ("k", np.array([600.0, 0.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 2.0]), "k = .*want fx, 0, cx"),
+        ("k", np.array([600.0, 3.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 1.0]), "k = .*expected fx, 0, cx"),
+        ("k", np.array([600.0, 0.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 2.0]), "k = .*expected fx, 0, cx"),
         ("binning_x", 2, "binning or a region of interest"),
         ("roi", RegionOfInterest(0, 1, HEIGHT // 2, WIDTH // 2, False), "binning or a region of interest"),
         ("k", np.eye(3).ravel(), r"k = .*principal point|k = .*focal"),
@@ -141,16 +141,16 @@ def test_wrong_intrinsics_are_refused_at_the_start(camera: Camera, tmp_path: Pat
 @pytest.mark.parametrize(
     ("field", "value", "found"),
     [
-        ("encoding", "rgb8", "encoding = 'rgb8', want"),
-        ("encoding", "64FC1", "encoding = '64FC1', want"),
-        ("encoding", "", "encoding = '', want"),
+        ("encoding", "rgb8", "encoding = 'rgb8', expected"),
+        ("encoding", "64FC1", "encoding = '64FC1', expected"),
+        ("encoding", "", "encoding = '', expected"),
         ("data", np.zeros(3 * WIDTH, np.uint8), "24 bytes for 6 rows of 32"),
         ("step", 2 * WIDTH, "rows of 16"),
         *(
             ("data", np.full(WIDTH * HEIGHT, depth, "<f4").view(np.uint8), "no pixel has a depth of 0 to 65.5 m")
             for depth in (0.0, NAN, 750.0, 65.535, -0.75, np.inf)
         ),
-        ("is_bigendian", 1, r"median depth is 2\.3e-41 m, want 0\.05 to 20 m: see encoding, unit, is_bigendian"),
+        ("is_bigendian", 1, r"median depth is 2\.3e-41 m, expected 0\.05 to 20 m: see encoding, unit, is_bigendian"),
         ("data", np.full(WIDTH * HEIGHT, 0.75, ">f4").view(np.uint8), "see encoding, unit, is_bigendian"),
         ("data", np.full(WIDTH * HEIGHT, 0.0075, "<f4").view(np.uint8), "median depth is 0.0075 m"),
         ("data", np.full(WIDTH * HEIGHT, 28.0, "<f4").view(np.uint8), "median depth is 28 m"),

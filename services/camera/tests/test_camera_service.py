@@ -127,7 +127,7 @@ def test_a_link_before_the_abdomen_hides_it() -> None:
 
 def test_a_surface_in_another_frame_is_refused() -> None:
     service = create(Scenario())
-    with pytest.raises(ValueError, match=r"sim/surface: header.frame_id = 'abdomen', want 'world'"):
+    with pytest.raises(ValueError, match=r"sim/surface: header.frame_id = 'abdomen', expected 'world'"):
         service.step(0, HandInbox().receive({"sim/surface": plate(frame="abdomen"), "planning/camera_trigger": trigger(1)}))
 
 

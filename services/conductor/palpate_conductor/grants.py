@@ -127,7 +127,7 @@ class Grants:
         if self.last:
             raise UserError("the run is ending")
         if request not in TIME_REQUESTS:
-            raise UserError(f"{request}: want one of {', '.join(TIME_REQUESTS)}")
+            raise UserError(f"{request}: expected one of {', '.join(TIME_REQUESTS)}")
         if request == "pause":
             self._paused_at = self._paused_at if self.paused else monotonic()
             self.paused = True

@@ -74,7 +74,7 @@ class OperatorRequestServer:
             word, ms, sent = asked["word"], int(asked.get("ms", 0)), int(asked.get("sent", 0))
             request = None if word in TIME_REQUESTS else WORDS[word]
         except (AttributeError, KeyError, OverflowError, TypeError, UserError, ValueError, zenoh.ZError):
-            self._reply(query, False, f"no request: want one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
+            self._reply(query, False, f"no request: expected one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
             return
         if word in TAGGED and not self._authentic(query, payload, sent):
             self._reply(query, False, f"{word} is refused: it needs the run's key (PALPATE_KEY), and a time after the last", 0.0)

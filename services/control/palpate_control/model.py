@@ -25,7 +25,7 @@ class ArmModel:
         self._model = pin.buildModelFromXML(urdf)
         self.joints: int = self._model.nv
         if self._model.nq != self.joints:
-            raise ValueError(f"robot description has {self._model.nq} positions of {self.joints} joints, want one a joint")
+            raise ValueError(f"robot description has {self._model.nq} positions of {self.joints} joints, expected one a joint")
         if not self._model.existFrame(frame):
             raise ValueError(f"robot description has no link {frame!r}")
         self._data = self._model.createData()

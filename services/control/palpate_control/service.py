@@ -144,7 +144,7 @@ class ControlService(Service):
         counts = {len(values) for values in (setpoint.q, setpoint.qd, setpoint.joint_stiffness)}
         if counts != {self.model.joints}:
             names = "joint_position, joint_velocity, joint_stiffness"
-            self._refuse(t, f"{names}: {sorted(counts)} values, want {self.model.joints} each")
+            self._refuse(t, f"{names}: {sorted(counts)} values, expected {self.model.joints} each")
             return
         motion = (setpoint.p_WD, setpoint.V_WD, setpoint.F_W, setpoint.stiffness, setpoint.damping_ratio)
         if not np.isfinite(np.concatenate((*motion, setpoint.q, setpoint.qd, setpoint.joint_stiffness))).all():

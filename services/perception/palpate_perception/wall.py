@@ -160,7 +160,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
 def _check_count(keep: NDArray[np.bool_], what: str) -> None:
     """Raise WallNotVisibleError if too few pixels are kept."""
     if (count := np.count_nonzero(keep)) < WALL_FIT.min_pixels:
-        raise WallNotVisibleError(f"{count} pixels of the small image {what}, want {WALL_FIT.min_pixels}")
+        raise WallNotVisibleError(f"{count} pixels of the small image {what}, expected {WALL_FIT.min_pixels}")
 
 
 def find_steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:

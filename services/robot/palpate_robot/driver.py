@@ -198,10 +198,10 @@ class Driver:
             self.mode = DriverMode.ACTIVE
 
     def _check(self, t: int, command: Command, q: Array, gravity: Array) -> None:
-        shape, want = np.shape(command.values), (self._arm.joints,)
-        if shape != want:
+        shape, expected = np.shape(command.values), (self._arm.joints,)
+        if shape != expected:
             what = "position" if self._positions else "torque"
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {what} of shape {shape}, want {want}")
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {what} of shape {shape}, expected {expected}")
             return
         if command.stamp > t + TUNING.ahead_ns:
             ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6

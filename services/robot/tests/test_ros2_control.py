@@ -175,7 +175,7 @@ def test_a_ur_ignores_a_jump_of_the_target_and_is_unlocked_five_seconds_after_a_
         rules.event("recover 1")
         assert bool(rules.stopped) is stopped
     for event in ("lookahead 0", "speed 1.5", "unknown 1", "speed x"):
-        with pytest.raises(UserError, match="want a name"):
+        with pytest.raises(UserError, match="expected one of"):
             rules.event(event)
 
 

@@ -138,7 +138,7 @@ def next_press(chosen: Policy, posterior: Posterior, left: Budget) -> tuple[Arra
         place, depth = asked
         return check_request(place, float(depth), posterior.task)
     except (TypeError, ValueError) as error:
-        raise PluginError(f"search.policy: returned {asked!r}, want (place, depth): (x, y) [m] and a number [m]") from error
+        raise PluginError(f"search.policy: returned {asked!r}, expected (place, depth): (x, y) [m] and a number [m]") from error
 
 
 def check_request(place: ArrayLike, depth: float, task: Task) -> tuple[Array, float]:

@@ -115,7 +115,7 @@ class RestSurface:
         """
         if vertices_W.shape != normals_W.shape or not len(vertices_W):
             raise ValueError(
-                f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: want the same non-empty shape"
+                f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: expected the same non-empty shape"
             )
         if not (np.isfinite(vertices_W).all() and np.isfinite(normals_W).all()):
             raise ValueError("perceived surface: vertices and normals must be finite")

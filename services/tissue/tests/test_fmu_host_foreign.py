@@ -236,7 +236,7 @@ def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contrac
         ("role: lag", "role: tissue", ("'tissue'", "source, lag")),
         ("  place:", "  follower:", ("follower", "can read place")),
         ("{u: {field", "{v: {field", ("place.pose.position", "no variable 'v'", "u, y")),
-        ("u: {field", "y: {field", ("y", "want an input or a tunable parameter")),
+        ("u: {field", "y: {field", ("y", "expected an input or a tunable parameter")),
         ("field: pose.position", "field: pose.posture", ("pose.posture", "pose.position.x")),
         ("field: pose.position", "field: pose.orientation", ("4 values", "has 3")),
         ("frame: body", "frame: moon", ("moon", "world, body")),

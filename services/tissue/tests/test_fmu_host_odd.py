@@ -215,9 +215,9 @@ def test_a_map_may_name_a_topic_without_variables_an_element_or_a_boolean(versio
         ({}, "not an FMU"),
         ({"modelDescription.xml": "<fmi"}, "not XML"),
         ({"modelDescription.xml": "<html/>"}, "not an FMU: the root"),
-        ({"modelDescription.xml": '<fmiModelDescription fmiVersion="1.0"/>'}, "FMI 1.0; want 2.0 or 3.0"),
-        ({"modelDescription.xml": '<fmiModelDescription fmiVersion="3.0-beta.2"/>'}, "FMI 3.0-beta.2; want 2.0 or 3.0"),
-        ({"modelDescription.xml": "<fmiModelDescription/>"}, "FMI of no version; want"),
+        ({"modelDescription.xml": '<fmiModelDescription fmiVersion="1.0"/>'}, "FMI 1.0; expected 2.0 or 3.0"),
+        ({"modelDescription.xml": '<fmiModelDescription fmiVersion="3.0-beta.2"/>'}, "FMI 3.0-beta.2; expected 2.0 or 3.0"),
+        ({"modelDescription.xml": "<fmiModelDescription/>"}, "FMI of no version; expected"),
         ({"modelDescription.xml": '<fmiModelDescription fmiVersion="2.0" guid="x"/>'}, "without co-simulation"),
         ({"modelDescription.xml": description(2), "binaries/win64/": "", "binaries/win64/wall.dll": "x"}, "it has win64"),
         ({"modelDescription.xml": description(2), "binaries/linux64/": ""}, "it has none"),
@@ -248,5 +248,5 @@ def test_a_map_with_a_number_that_is_not_finite_is_refused(field: str) -> None:
 def test_a_variable_of_text_is_refused_by_name(rules: Contract, tmp_path: Path) -> None:
     text = '<ScalarVariable name="s" valueReference="8" causality="output" variability="discrete"><String/></ScalarVariable>'
     path = build_wall(tmp_path / "w.fmu", 2, description(2, text))
-    with pytest.raises((MapError, FmuError), match="s: of type String; want"):
+    with pytest.raises((MapError, FmuError), match="s: of type String; expected"):
         host("wall", path, table(force="s"), {}, contract=rules)

@@ -107,7 +107,7 @@ def create(scenario: Scenario) -> Service:
 def surface_mesh(message: Message) -> Mesh:
     """Return the mesh in a SurfaceMesh message. Raises ValueError if it is not in world."""
     if message.header.frame_id != "world":
-        raise ValueError(f"sim/surface: header.frame_id = {message.header.frame_id!r}, want 'world'")
+        raise ValueError(f"sim/surface: header.frame_id = {message.header.frame_id!r}, expected 'world'")
     vertices = np.asarray(message.vertices, np.float64).reshape(-1, 3)
     triangles = np.array(message.triangles, np.uint32).reshape(-1, 3)  # copied: numba compiles again for read-only arrays
     return Mesh(vertices, triangles)

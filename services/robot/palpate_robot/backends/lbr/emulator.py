@@ -87,7 +87,7 @@ class FriSession:
     def __init__(self, period_ms: int, q: Array) -> None:
         """Raise UserError for a period outside FRI's range."""
         if period_ms not in PERIODS_MS:
-            raise UserError(f"send period {period_ms} ms: want whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
+            raise UserError(f"send period {period_ms} ms: expected whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
         self._dt = period_ms * 1e-3
         self.state = SessionState.IDLE
         self.quality = ConnectionQuality.POOR

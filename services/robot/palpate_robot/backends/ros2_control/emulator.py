@@ -142,7 +142,7 @@ def _split_time(text: str) -> tuple[float, str]:
     try:
         return float(time), event
     except ValueError:
-        raise UserError(f"event {text!r}: want a time [s], a name and a number, such as '12.5 speed 0.5'") from None
+        raise UserError(f"event {text!r}: expected a time [s], a name and a number, such as '12.5 speed 0.5'") from None
 
 
 def serve_graph(emulator: Ros2Emulator, node: RosNode, level: CommandLevel) -> None:

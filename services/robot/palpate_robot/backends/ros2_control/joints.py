@@ -51,7 +51,7 @@ class MeasuredJoints(MeasuredArm):
             q, v = self._in_order(state.position), self._in_order(state.velocity)
             torque = self._in_order(state.effort) if self._torques else self.torque
         except IndexError:
-            self._fault = "joint states: want a position, a velocity and an effort of each joint"
+            self._fault = "joint states: expected a position, a velocity and an effort of each joint"
             return False
         if not np.isfinite(np.concatenate((q, v, torque))).all():
             self._fault = f"joint states: position = {q}, velocity = {v}, effort = {torque}: must be finite"

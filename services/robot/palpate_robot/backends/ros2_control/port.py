@@ -48,7 +48,7 @@ class Ros2Port(ArmPort):
 
         Raises UserError where the stack has none.
         """
-        raise UserError("robot.level: this stack takes no set-points; want torque or position")
+        raise UserError("robot.level: this stack takes no set-points; expected torque or position")
 
 
 def array_message(values: Array) -> Any:

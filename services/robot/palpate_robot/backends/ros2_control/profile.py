@@ -56,7 +56,7 @@ def profile_of(robot: Robot) -> Profile:
     name = given.profile or ""
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     if not path.is_file():
-        raise UserError(f"robot.driver.profile: {name or 'not set'}: want {known}, or the path of a YAML file")
+        raise UserError(f"robot.driver.profile: {name or 'not set'}: expected {known}, or the path of a YAML file")
     profile = read_model(path, Profile)
     fields = ("namespace", "joint_states", "ft_topic", "ft_sign", "ft_weight")
     changes = {name: value for name in fields if (value := getattr(given, name)) is not None}

@@ -76,7 +76,7 @@ class Rules(ABC):
         low, high = self.ranges.get(name, (0.0, np.inf))
         if not low <= number <= high or name not in (*self.settings, "recover"):
             raise UserError(
-                f"event {text!r}: want a name of {', '.join((*self.settings, 'recover'))} and a number from {low:g} to {high:g}"
+                f"event {text!r}: expected one of {', '.join((*self.settings, 'recover'))} and a number {low:g} to {high:g}"
             )
         if name == "recover":
             self._recover()

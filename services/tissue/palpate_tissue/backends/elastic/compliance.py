@@ -84,9 +84,9 @@ class LayerKernel:
 
     def __init__(self, poisson: float = 0.49, thickness_m: float = math.inf) -> None:
         if not 0 <= poisson < 0.5:
-            raise ValueError(f"poisson = {poisson}: want 0 <= poisson < 0.5")
+            raise ValueError(f"poisson = {poisson}: expected 0 <= poisson < 0.5")
         if not thickness_m > 0:
-            raise ValueError(f"thickness_m = {thickness_m}: want more than 0")
+            raise ValueError(f"thickness_m = {thickness_m}: expected more than 0")
         self.poisson = poisson
         self.thickness_m = thickness_m
         self._base = _base_term(poisson) if math.isfinite(thickness_m) else None

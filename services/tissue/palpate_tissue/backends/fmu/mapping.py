@@ -61,7 +61,7 @@ class OutputEntry(MapEntry):
     @model_validator(mode="after")
     def _one(self) -> OutputEntry:
         if sum(source is not None for source in (self.variable, self.scenario, self.value)) != 1:
-            raise ValueError("want exactly one of variable, scenario, value")
+            raise ValueError("expected exactly one of variable, scenario, value")
         return self
 
 

@@ -148,7 +148,7 @@ class OutputTopic(NamedTuple):
         for port in self.ports:
             port.pull()
             if wrong := port.not_finite():
-                raise FmuError(f"{self.fmu}: {wrong} at {t / NS:g} s, for {self.topic.name}: want finite numbers")
+                raise FmuError(f"{self.fmu}: {wrong} at {t / NS:g} s, for {self.topic.name}: expected finite numbers")
         message = blank(self.topic.type, t, self.topic.frame or "")
         for paths, value in (*self.constants, *((paths, convert(source)) for paths, source, convert in self.moves)):
             fill(message, paths, value)
@@ -202,7 +202,7 @@ class Wiring:
             where, variable = f"{name}.{entry.field} -> {key}", chosen[key]
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
                 raise MapError(
-                    f"{where}: it is a {variable.variability} {variable.causality}; want an input or a tunable parameter"
+                    f"{where}: it is a {variable.variability} {variable.causality}; expected an input or a tunable parameter"
                 )
             convert = self._conversion(entry, topic, entry.field, variable, where, into_fmu=True)
             moves.append((ports[key][key], entry.field, convert))
@@ -248,7 +248,7 @@ class Wiring:
         ours, theirs = self._table.frame, topic.frame
         for frame, owner in ((ours, "the map"), (theirs, f"the contract for {topic.name}")):
             if frame not in self._frames:
-                raise MapError(f"{where}: unknown frame {frame} of {owner}; want one of {', '.join(self._frames)}")
+                raise MapError(f"{where}: unknown frame {frame} of {owner}; expected one of {', '.join(self._frames)}")
         if ours == theirs:
             return _same
         X = inverse(self._frames[str(ours)]) @ self._frames[str(theirs)]
