@@ -47,9 +47,7 @@ def build(
     fmi: Annotated[int, typer.Option(min=2, max=3, help="FMI version; version 2 has only a sample of the surface.")] = 3,
     only: Annotated[
         list[str] | None,
-        typer.Option(
-            "--platform", metavar="NAME", help="Platform of a binary, such as x86_64-linux; may be repeated. By default all."
-        ),
+        typer.Option("--platform", metavar="NAME", help="Platform, such as x86_64-linux; may be repeated. By default all."),
     ] = None,
     settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,

@@ -21,9 +21,7 @@ def make(
     folder: Folder = DEFAULT,
     host: Annotated[list[str] | None, typer.Option(help="Name or address of the router; may be repeated.")] = None,
     name: Annotated[list[str] | None, typer.Option(help="Members; by default all roles, router, viewer and operator.")] = None,
-    days: Annotated[
-        int | None, typer.Option(min=1, help="Validity of the certificates in days; by default two years and three months.")
-    ] = None,
+    days: Annotated[int | None, typer.Option(min=1, help="Validity in days; by default two years and three months.")] = None,
 ) -> None:
     """Make a certificate authority and a certificate for each role; valid ones are kept."""
     from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, init, members
@@ -56,9 +54,7 @@ SECURE_ENDPOINT = "tls/[::]:7447"
 
 def router(
     listen: Annotated[list[str] | None, typer.Argument(help="Endpoints to listen on, e.g. tcp/0.0.0.0:7447.")] = None,
-    keys: Annotated[
-        Path | None, typer.Option(help="The router's folder of certificates: a secure router, at tls/ endpoints.")
-    ] = None,
+    keys: Annotated[Path | None, typer.Option(help="The router's certificates: a secure router, at tls/ endpoints.")] = None,
 ) -> None:
     """Run a zenoh router for services in containers or on several machines, until it is stopped."""
     from palpate_bus.contract import contract

@@ -14,9 +14,7 @@ from palpate.run.options import Settings
 def reproduce(
     out: Annotated[Path, output_folder("Folder of the runs; finished ones are kept.", "--out", "-o")] = Path("out/reproduction"),
     docs: Annotated[Path | None, output_file("The page; by default reproduction.md in the folder of the runs.")] = None,
-    every: Annotated[
-        bool, typer.Option("--all", help="Also run raster continuous and snake point, which separates the two gains.")
-    ] = False,
+    every: Annotated[bool, typer.Option("--all", help="Also run raster continuous and snake point.")] = False,
     again: Annotated[bool, typer.Option("--again", help="Repeat finished runs.")] = False,
     settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the page's path only.")] = False,

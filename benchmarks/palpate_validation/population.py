@@ -135,9 +135,7 @@ def section(found: pd.DataFrame | None = None) -> PageSection:
         "Ten people determine an SD between people to a quarter, which is the width of the bounds. The people were young, male "
         "and slim; other builds are not validated."
     )
-    return PageSection(
-        "population", "Check of the sampler of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8)
-    )
+    return PageSection("population", "Check of the person sampler", text, checks, lambda f: draw(f, found, people), (7.0, 2.8))
 
 
 def draw(figure: Figure, found: pd.DataFrame, people: pd.DataFrame) -> None:

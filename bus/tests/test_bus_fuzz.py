@@ -65,7 +65,7 @@ def test_choosing_targets() -> None:
 
 @pytest.mark.parametrize(
     ("topic", "stamp", "length", "data", "words"),
-    [([0, 0], [1], [2, 3], 5, "columns"), ([0, 7], [1, 1], [2, 3], 5, "topic 7 of only 2"), ([0, 1], [1, 1], [2, 3], 6, "bytes")],
+    [([0, 0], [1], [2, 3], 5, "columns"), ([0, 7], [1, 1], [2, 3], 5, "topic 7 of 2"), ([0, 1], [1, 1], [2, 3], 6, "bytes")],
 )
 def test_a_chunk_that_is_not_one_piece_is_refused(
     topic: list[int], stamp: list[int], length: list[int], data: int, words: str

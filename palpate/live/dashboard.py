@@ -29,18 +29,14 @@ def dashboard(
     source: Annotated[
         str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; by default the current run.")
     ] = None,
-    port: Annotated[
-        int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next port.")
-    ] = 9876,
+    port: Annotated[int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next.")] = 9876,
     native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
     chosen: ChosenRun = None,
     picture: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Write a picture of a recorded run at the time --at; needs Chromium.")
     ] = None,
     at: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="With --picture: the simulated time.")] = 60.0,
-    film_file: Annotated[
-        Path | None, typer.Option("--film", metavar="GIF", help="Write a film of a recorded run; needs Chromium.")
-    ] = None,
+    film_file: Annotated[Path | None, typer.Option("--film", metavar="GIF", help="Film a recorded run; needs Chromium.")] = None,
 ) -> None:
     """Watch a run live in the browser, from its start or later, or from its recording. This does not slow the run down.
 

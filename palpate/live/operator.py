@@ -17,9 +17,7 @@ from palpate_errors import ExitStatus, PalpateError
 
 def stop(
     reason: Annotated[str, typer.Argument(help="Reason, for the record.")] = "palpate stop",
-    soft: Annotated[
-        bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
-    ] = False,
+    soft: Annotated[bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding.")] = False,
     run: ChosenRun = None,
 ) -> None:
     """Stop a run at once: the arm holds safely until `palpate release`. Without --run, every run on this machine stops."""

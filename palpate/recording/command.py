@@ -14,9 +14,7 @@ def assess(
         Path, typer.Argument(metavar="RECORDING", help="CSV, Parquet, MCAP, a rosbag2 folder, or the results folder of a run.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results; with --inspect the file of the mapping.")],
-    mapping: Annotated[
-        Path | None, typer.Option("--mapping", "-m", help="YAML file: columns or topics, units, frames, tool.")
-    ] = None,
+    mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="YAML: columns or topics, units, frames, tool.")] = None,
     inspect: Annotated[bool, typer.Option("--inspect", help="Propose a mapping, with a picture next to it.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Remove earlier results from the folder.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print report.json.")] = False,

@@ -115,16 +115,12 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
     position, force = triple(_POSITION), triple(_FORCE)
     single = column(_SINGLE)
     if position is None or (force is None and single is None):
-        raise ReadingError(
-            f"{name}: columns of position or force are not recognised among {', '.join(names[:20])}; write the mapping by hand"
-        )
+        raise ReadingError(f"{name}: no columns of position or force among {', '.join(names[:20])}; write the mapping by hand")
     time, probe = column(_TIME), column(_PROBE)
     quaternion = next((q for q in (_four(names, "xyzw"), _four(names, "wxyz"), _four(names, "0123")) if q), None)
     order = "wxyz" if quaternion and re.search(r"[w0]", quaternion[0]) else "xyzw"
     if time is None and probe is None:
-        raise ReadingError(
-            f"{name}: neither a column of time nor one of a probe's number is recognised; write the mapping by hand"
-        )
+        raise ReadingError(f"{name}: no column of time or of a probe's number is recognised; write the mapping by hand")
     columns = MappedColumns(
         position=position,
         force=force or (str(single),),

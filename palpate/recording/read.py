@@ -363,9 +363,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     known = None if readings.normal is None else readings.normal.mean(axis=0)
     axis = pressing_axis(readings.position, readings.force, parts, known)
     if axis is None:
-        raise ReadingError(
-            f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
-        )
+        raise ReadingError(f"{name}: the force does not change with the motion of the tool; check their columns")
     if axis.angle_deg > LIMITS.wrong_frame_deg:
         return _without_contacts(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
     if axis.angle_deg > LIMITS.doubtful_frame_deg:

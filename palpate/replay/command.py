@@ -8,23 +8,17 @@ import typer
 
 def replay(  # noqa: PLR0913 - the options of a command
     file: Annotated[Path, typer.Argument(help="A run's folder, a rosbag2 folder or an .mcap file.")],
-    service: Annotated[
-        str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Re-run this service: tissue, tissue=fmu, ...")
-    ] = None,
+    service: Annotated[str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Re-run a service: tissue=fmu, ...")] = None,
     rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds per second.")] = 1.0,
     begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at, in seconds.")] = 0.0,
     length: Annotated[float | None, typer.Option("--for", min=0.0, help="Duration to play, in simulated seconds.")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", help="Play these topics only; may be repeated.")] = None,
-    listen: Annotated[
-        str | None, typer.Option(help="Endpoint to play at; by default that of PALPATE_LISTEN and PALPATE_ROUTER.")
-    ] = None,
+    listen: Annotated[str | None, typer.Option(help="Endpoint to play at; by default PALPATE_LISTEN and PALPATE_ROUTER.")] = None,
     hold: Annotated[bool, typer.Option("--hold", help="Stay on the bus at the end until Ctrl-C.")] = False,
     drive: Annotated[bool, typer.Option("--drive", help="Play even if a running service would act on it.")] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="X|TOPIC:FIELD=X", help="Allowed difference: part of each field's range (1e-06), or in a field's unit."
-        ),
+        typer.Option(metavar="X|TOPIC:FIELD=X", help="Allowed difference: part of each field's range (1e-06), or in its unit."),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default that of the run.")] = None,
     update_refs: Annotated[Path | None, typer.Option(help="With --service: write its reference to this file.")] = None,

@@ -212,9 +212,7 @@ def read_evidence(folder: Path) -> Evidence:
     """Return the evidence of the run in `folder`. Raises EvidenceError."""
     path = folder / FILE
     if not path.is_file():
-        raise EvidenceError(
-            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
-        )
+        raise EvidenceError(f"{path} is not there: give the results folder; after a loss of the conductor with --recover")
     try:
         with InputFile(path, EvidenceError) as stream:
             reader = make_reader(stream)

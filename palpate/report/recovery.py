@@ -129,9 +129,7 @@ def resumption(folder: Path) -> Resumption:
     if not len(reached.felt.time):
         raise archive.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
-        raise archive.EvidenceError(
-            f"--resume {folder}: all targets were reached; palpate report {folder} --recover has its findings"
-        )
+        raise archive.EvidenceError(f"--resume {folder}: all targets were reached; see palpate report {folder} --recover")
     lost = tuple(text for run in runs for text in run.recording.damage)
     return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs), lost)
 

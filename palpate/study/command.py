@@ -64,17 +64,11 @@ def run(  # noqa: PLR0913 - the options of a command
     services: ServiceChoices = None,
     settings: Settings = None,
     seeds_file: Annotated[Path | None, typer.Option(help="File of secret seeds for the splits test and shift.")] = None,
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep cases from another version of the code instead of refusing.")
-    ] = False,
-    runs: Annotated[
-        bool, typer.Option("--runs", help="Keep map, evidence and page of each whole examination too, 4 MB each.")
-    ] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep cases from another version of the code.")] = False,
+    runs: Annotated[bool, typer.Option("--runs", help="Keep map, evidence and page of each whole examination.")] = False,
     out: Annotated[
         Path | None,
-        output_folder(
-            "Folder of the study; by default out/study/NAME-SPLIT. Finished cases in it are not run again.", "--out", "-o"
-        ),
+        output_folder("Folder of the study; by default out/study/NAME-SPLIT. Finished cases are not run again.", "--out", "-o"),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the result only.")] = False,
 ) -> None:
@@ -131,9 +125,7 @@ def merge_parts(
 
 @app.command("scenario")
 def scenario_of_case(
-    case: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A case of a study, such as out/study/release-test/cases/ID.json.")
-    ],
+    case: Annotated[Path, typer.Argument(metavar="FILE", help="A case, such as out/study/release-test/cases/ID.json.")],
 ) -> None:
     """Print the scenario of a case, to examine its patient again with everything a run shows.
 

@@ -164,9 +164,7 @@ class Folder:
         if old is not None and (old.study, old.split) != (manifest.study, manifest.split):
             raise StudyError(f"{self.path} holds {old.study}, split {old.split}: give {manifest.study} another folder with -o")
         if old is not None and {row.case_id for row in old.cases}.isdisjoint(row.case_id for row in manifest.cases):
-            raise StudyError(
-                f"{self.path} holds {old.study} with other settings or patients: give this one another folder with -o"
-            )
+            raise StudyError(f"{self.path} holds {old.study} with other settings or patients: give another folder with -o")
         (self.path / "cases").mkdir(parents=True, exist_ok=True)
         write_text(self.path / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
 
@@ -208,9 +206,7 @@ class Folder:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError) as error:
-            raise StudyError(
-                f"{path} is not an outcome of this version ({error}): remove it, and its case is run again"
-            ) from error
+            raise StudyError(f"{path} is not an outcome of this version ({error}): remove it to run its case again") from error
         return outcome
 
     def outcomes(self, manifest: Manifest) -> list[Outcome]:

@@ -9,9 +9,7 @@ from palpate.console import output_folder
 
 
 def fit(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="CSV, Parquet, MCAP or rosbag2 of an arm; folder of a run.")
-    ],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="CSV, Parquet, MCAP or rosbag2; folder of a run.")],
     mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Its mapping, as for `palpate assess`.")] = None,
     out: Annotated[Path, output_folder("Folder of twin.yaml, twin.csv, twin.png and twin.json.", "--out", "-o")] = Path("twin"),
     elastic: Annotated[bool, typer.Option("--elastic", help="Fit Young's modulus, for the elastic tier.")] = False,

@@ -195,7 +195,7 @@ def test_a_folder_holds_the_cases_of_one_request(tmp_path: Path) -> None:
     Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 1))))
     Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 3))))
     poor = cases_of(study(), Request("test", 3, ("errors=poor",)))
-    with pytest.raises(StudyError, match="other settings or patients: give this one another folder with -o"):
+    with pytest.raises(StudyError, match="other settings or patients: give another folder with -o"):
         Folder(tmp_path).open(manifest_of("toy", poor))
 
 

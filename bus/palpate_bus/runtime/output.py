@@ -76,9 +76,7 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
     if sum(lengths) != len(data):
         raise codec.CodecError(f"{CHUNK_TYPE}: lengths sum to {sum(lengths)} bytes, the data have {len(data)}")
     if min(stamps, default=0) < 0 or max(topics, default=-1) >= len(chunk.topics):
-        raise codec.CodecError(
-            f"{CHUNK_TYPE}: stamp {min(stamps)} ns below 0, or topic {max(topics)} of only {len(chunk.topics)}"
-        )
+        raise codec.CodecError(f"{CHUNK_TYPE}: stamp {min(stamps)} ns below 0, or topic {max(topics)} of {len(chunk.topics)}")
     ends = list(accumulate(lengths, initial=0))
     payloads = (data[begin:end] for begin, end in pairwise(ends))
     names = (chunk.topics[topic] for topic in topics)

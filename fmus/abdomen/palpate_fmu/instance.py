@@ -189,9 +189,7 @@ class FmuInstance:
                 self._fmu = _instantiate(self._folder, self.description)
         except Exception as error:
             self.close()
-            raise FmuError(
-                f"{path}: cannot be instantiated on {fmpy.platform_tuple}: {error} {_take_messages()}".strip()
-            ) from error
+            raise FmuError(f"{path}: not instantiated on {fmpy.platform_tuple}: {error} {_take_messages()}".strip()) from error
         self._component = self._fmu.component
         self._bind()
         try:

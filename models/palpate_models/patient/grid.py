@@ -100,9 +100,7 @@ def read_grid(path: Path) -> BodyGrid:
         bad = ~((table[name] >= low) & (table[name] <= high))
         if bad.any():
             row = int(bad.argmax())
-            raise GridError(
-                f"phantom.grid = {path}, row {row + 1}: {name} = {table[name][row]}: expected a number from {low:g} to {high:g}"
-            )
+            raise GridError(f"phantom.grid = {path}, row {row + 1}: {name} = {table[name][row]}, expected {low:g} to {high:g}")
     axes = [np.unique(table[name]) for name in ("x_m", "y_m")]
     for name, axis in zip(("x_m", "y_m"), axes, strict=True):
         steps = np.diff(axis)

@@ -104,9 +104,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     for index, structure in enumerate(map(structure_at_skin, phantom.structures)):
         share = np.where(normals[:, 2] > 0, structure_share(vertices[:, :2], structure), 0.0)
         if not share.any():
-            raise MeshError(
-                f"phantom.structures[{index}]: line_m {structure.line_m}: no point of the abdomen's front belongs to it"
-            )
+            raise MeshError(f"phantom.structures[{index}]: line_m {structure.line_m}: no point of the abdomen's front is in it")
         factor = 1 + (structure.factor - 1) * share
         background, young = background * factor, None if young is None else young * factor
     contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)

@@ -372,9 +372,7 @@ class _Reader(UrdfTree):
         if a < 0:
             self.faults.append(f"link {link}: inertia is not positive: a principal moment is {a:.3g} kg m^2")
         elif c > (a + b) * (1 + TUNING.inertia_tolerance):
-            self.faults.append(
-                f"link {link}: inertia against the triangle inequality: {c:.3g} kg m^2 is more than {a:.3g} and {b:.3g} together"
-            )
+            self.faults.append(f"link {link}: inertia against the triangle inequality: {c:.3g} > {a:.3g} + {b:.3g} kg m^2")
         elif c > mass * TUNING.largest_link_m**2 > 0:
             self.faults.append(f"link {link}: inertia of {c:.3g} kg m^2 with {mass:g} kg: its unit is not kg m^2")
 

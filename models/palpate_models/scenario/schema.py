@@ -224,9 +224,7 @@ class Camera(Section):
     @model_validator(mode="after")
     def _apart(self) -> Camera:
         if dist(self.position_m, self.look_at_m) < 0.1:
-            raise ValueError(
-                f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: expected at least 0.1 m between them"
-            )
+            raise ValueError(f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: expected 0.1 m or more apart")
         return self
 
 
@@ -262,9 +260,7 @@ class Limits(Section):
             raise ValueError("need force_working_n < force_soft_stop_n < force_emergency_n")
         for axis, low, high in zip("xyz", self.workspace_min_m, self.workspace_max_m, strict=True):
             if not -3 <= low < high <= 3:
-                raise ValueError(
-                    f"workspace_min_m and workspace_max_m: {axis} from {low:g} to {high:g} m; expected -3 <= min < max <= 3"
-                )
+                raise ValueError(f"workspace_min_m, workspace_max_m: {axis} {low:g} to {high:g} m; expected -3 <= min < max <= 3")
         return self
 
 

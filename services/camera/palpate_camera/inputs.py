@@ -62,7 +62,7 @@ class CameraInput(NamedTuple):
             named = message.header.frame_id.lstrip("/")
             if named != self.frame:
                 raise CameraError(
-                    f"{topic} is in frame {named!r}, the pose is that of {self.frame!r}: {self.other_frame.format(named)}"
+                    f"{topic} is in frame {named!r}, the pose is of {self.frame!r}: {self.other_frame.format(named)}"
                 )
         if (image.width, image.height) != (info.width, info.height):
             raise CameraError(f"{self.image} is {image.width} x {image.height}, {self.info} says {info.width} x {info.height}")

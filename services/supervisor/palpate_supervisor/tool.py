@@ -114,9 +114,7 @@ class RestSurface:
         Raises ValueError for an empty mesh, different shapes, or values that are not finite.
         """
         if vertices_W.shape != normals_W.shape or not len(vertices_W):
-            raise ValueError(
-                f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: expected the same non-empty shape"
-            )
+            raise ValueError(f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: expected one shape")
         if not (np.isfinite(vertices_W).all() and np.isfinite(normals_W).all()):
             raise ValueError("perceived surface: vertices and normals must be finite")
         self._vertices, self._normals, self._radius = np.ascontiguousarray(vertices_W, float), normals_W, radius

@@ -147,9 +147,7 @@ def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str
         source.check_seen(frames)
     if len(sizes := {frame.pinhole for frame in frames}) > 1:
         first, second = list(sizes)[:2]
-        raise CameraError(
-            f"{info}: the intrinsics change within the recording: {first} and {second}; record one mode of the camera"
-        )
+        raise CameraError(f"{info}: intrinsics change within the recording: {first} and {second}; record one mode of the camera")
     return frames
 
 

@@ -75,9 +75,7 @@ class Rules(ABC):
             number = np.nan
         low, high = self.ranges.get(name, (0.0, np.inf))
         if not low <= number <= high or name not in (*self.settings, "recover"):
-            raise UserError(
-                f"event {text!r}: expected one of {', '.join((*self.settings, 'recover'))} and a number {low:g} to {high:g}"
-            )
+            raise UserError(f"event {text!r}: expected one of {', '.join((*self.settings, 'recover'))}, then {low:g} to {high:g}")
         if name == "recover":
             self._recover()
         else:

@@ -120,9 +120,7 @@ def create(scenario: Scenario) -> Ros2ControlService:
     if Settings.read().runtime == "wallclock":
         return Ros2ControlService(exam, ZenohRos2Port(exam.robot, profile), profile)
     if not exam.robot.driver.emulated:
-        raise BusConfigError(
-            "services.robot = ros2_control drives hardware: use --wallclock, or an emulated arm: robot.driver.emulated=true"
-        )
+        raise BusConfigError("services.robot = ros2_control drives hardware: use --wallclock or robot.driver.emulated=true")
     from palpate_robot.backends.ros2_control.emulator import EmulatedPort  # noqa: PLC0415 - has the physics, which a driver lacks
 
     return Ros2ControlService(exam, EmulatedPort(plant_input(scenario), profile), profile)

@@ -37,9 +37,7 @@ def main() -> int:
     try:
         robot = exam_input(load_scenario(given.scenario, given.set)).robot
         if robot.level is not CommandLevel.TORQUE:
-            raise UserError(
-                f"robot.level: {robot.level}: only an arm that takes torques has a watchdog; one that takes positions stays"
-            )
+            raise UserError(f"robot.level: {robot.level}: only an arm that takes torques has a watchdog; others stay")
         profile, arm = profile_of(robot), arm_of(robot)
         node = RosNode("palpate_watchdog", robot.driver.domain, BusOptions(router=robot.driver.router))
     except UserError as error:

@@ -175,9 +175,7 @@ class Wiring:
 
     def _topic(self, name: str, allowed: set[str], what: str) -> Topic:
         if name not in allowed:
-            raise MapError(
-                f"{name}: the role {self._table.role} does not {what} this topic; it can {what} {', '.join(sorted(allowed))}"
-            )
+            raise MapError(f"{name}: {self._table.role} does not {what} this topic; it can {what} {', '.join(sorted(allowed))}")
         return self._contract.topics[name]
 
     def _variable(self, name: str, where: str) -> FmuVariable:
@@ -201,9 +199,7 @@ class Wiring:
         for key, entry in entries.items():
             where, variable = f"{name}.{entry.field} -> {key}", chosen[key]
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
-                raise MapError(
-                    f"{where}: it is a {variable.variability} {variable.causality}; expected an input or a tunable parameter"
-                )
+                raise MapError(f"{where}: {variable.variability} {variable.causality}; expected an input or a tunable parameter")
             convert = self._conversion(entry, topic, entry.field, variable, where, into_fmu=True)
             moves.append((ports[key][key], entry.field, convert))
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
