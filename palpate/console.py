@@ -24,7 +24,7 @@ class SteadyConsole(Console):
     """Console of every command. Shows foreign text as it is: no markup, control characters escaped. Tolerates a closed pipe."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(markup=False, emoji=False, **options)
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """Yield the segments of whatever is printed, without control characters in its texts."""
@@ -88,7 +88,7 @@ class CommandGroup(TyperGroup):
 
 def say(text: object) -> None:
     """Print a message to standard error."""
-    SteadyConsole(stderr=True).print(Text.assemble(("palpate:", "bold red"), f" {text}"), highlight=False, soft_wrap=True)
+    SteadyConsole(stderr=True).print(Text.assemble(("palpate:", "bold red"), f" {text}"), soft_wrap=True)
 
 
 def refuse(text: object) -> NoReturn:
@@ -135,9 +135,9 @@ def _output(text: str, names: tuple[str, ...], folder: bool) -> typer.models.Opt
 
 def wide_console(min_width: int = 0) -> Console:
     """Return a console on standard output of at least `min_width` columns, and 140 if it is a pipe, so that tables stay whole."""
-    plain = SteadyConsole(highlight=False)
+    plain = SteadyConsole()
     min_width = max(min_width, 0 if plain.is_terminal else 140)
-    return plain if plain.width >= min_width else SteadyConsole(highlight=False, width=min_width)
+    return plain if plain.width >= min_width else SteadyConsole(width=min_width)
 
 
 _DOCUMENT: TextIO | None = None
@@ -200,7 +200,7 @@ class CaseDisplay(progress.Progress):
         """Show the number of finished cases and the name of the last one."""
         self.update(self._task, completed=done, total=total, last=last)
         if self._lines and done:
-            self.console.print(f"{done} of {total}  {last}", highlight=False)
+            self.console.print(f"{done} of {total}  {last}")
 
 
 class TimeLeft(progress.Progress):

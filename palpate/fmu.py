@@ -67,7 +67,7 @@ def build(
         build_scenario_fmu(scenario, out, fmi, names, compiling=compiling)
     if not quiet:
         size = f"{out.stat().st_size / 1e6:.1f} MB"
-        console.print(f"{out}: FMI {fmi}.0, {size}, for {', '.join(names)}", highlight=False, soft_wrap=True)
+        console.print(f"{out}: FMI {fmi}.0, {size}, for {', '.join(names)}", soft_wrap=True)
 
 
 def _states(count: int) -> str:
@@ -91,8 +91,8 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     platforms = binary_folders(file)
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(Text.assemble((description.modelName, "bold"), f" FMI {description.fmiVersion}, {', '.join(kinds)}"))
-    console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}", highlight=False)
-    console.print(_states(int(description.numberOfContinuousStates or 0)), highlight=False, soft_wrap=True)
+    console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}")
+    console.print(_states(int(description.numberOfContinuousStates or 0)), soft_wrap=True)
     table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
     for v in read_variables(description).values():
         bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"
@@ -107,7 +107,7 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     except Exception as error:  # FMPy raises many kinds for an FMU with findings
         findings = getattr(error, "problems", (str(error),))
     verdict = "\n".join(("findings of the validator, which do not prevent its use:", *findings)) if findings else verdict
-    console.print(verdict, highlight=False)
+    console.print(verdict)
 
 
 @app.command()
@@ -141,8 +141,8 @@ def simulate(
     except FmuError as error:
         refuse(f"{error} (this machine is {native()})")
     if probing is None:
-        console.print(f"{out}: {', '.join(names)}", highlight=False)
+        console.print(f"{out}: {', '.join(names)}")
         return
     write_csv(probing, out.with_suffix(".csv"))
     plot_probing(probing, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
-    console.print(f"{out}: maximum force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm", highlight=False)
+    console.print(f"{out}: maximum force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm")

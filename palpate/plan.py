@@ -55,10 +55,10 @@ def plan(
     except NoPathError as error:
         refuse(error)
     console = SteadyConsole()
-    console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
+    console.print(summary(chosen.exam, planned), soft_wrap=True)
     for reason, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
-        console.print(f"{count} targets are left out: {reason}", highlight=False, soft_wrap=True)
-    console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
+        console.print(f"{count} targets are left out: {reason}", soft_wrap=True)
+    console.print(f"drawn in {out}", soft_wrap=True)
 
 
 class Prospect(NamedTuple):

@@ -26,7 +26,7 @@ def make(
     """Make a certificate authority and a certificate for each role; valid ones are kept."""
     from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, init, members
 
-    console = SteadyConsole(stderr=True, highlight=False, soft_wrap=True)
+    console = SteadyConsole(stderr=True, soft_wrap=True)
     for known in name or ():
         if known not in members():
             raise UserError(f"--name {known}: members are {', '.join(members())}")

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from palpate.console import CaseDisplay, output_file, wide_console
+from palpate.console import CaseDisplay, SteadyConsole, output_file, wide_console
 from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def bench(
     from palpate.report.files import fingerprint, write_text
     from palpate.run.inputs import check_usable
 
-    screen, console = Console(stderr=True), wide_console(160)
+    screen, console = SteadyConsole(stderr=True), wide_console(160)
     cases = run_cases(check_usable(scenario, settings))
     figures: dict[str, Any] = {"platform": fingerprint(), "runs": {}}
     try:
@@ -47,7 +46,7 @@ def bench(
         for table in tables(figures):
             console.print(table)
         if out.is_file():
-            console.print(f"{platform.platform()}, written to {out}", highlight=False)
+            console.print(f"{platform.platform()}, written to {out}")
 
 
 def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:

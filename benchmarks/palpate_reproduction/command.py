@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from palpate.console import CaseDisplay, fail, output_file, output_folder, print_line, refuse
+from palpate.console import CaseDisplay, SteadyConsole, fail, output_file, output_folder, print_line, refuse
 from palpate.run.options import Settings
 
 
@@ -26,7 +25,7 @@ def reproduce(
     from palpate_reproduction.page import write_page
     from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, ReproductionError, perform, record_graph
 
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     quiet = quiet or as_json
     cases = CASES if every else (SNAKE, POINTS)
     chosen = tuple(settings or ())
@@ -58,7 +57,6 @@ def reproduce(
     if not quiet:
         console.print(
             f"snake with continuous indentation covers {facts['factor']:.1f} times faster than raster with points; "
-            f"map and model have a correlation of {facts['correlation']:.3f}",
-            highlight=False,
+            f"map and model have a correlation of {facts['correlation']:.3f}"
         )
     print(page)

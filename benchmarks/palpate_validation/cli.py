@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-from palpate.console import CaseDisplay, output_folder, refuse, wide_console
+from palpate.console import CaseDisplay, SteadyConsole, output_folder, refuse, wide_console
 from palpate_errors import ExitStatus
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ def validate(
     """Measure the physics against Hertz, measured people, DART and theory. The exit status is 3 if a bound is missed."""
     from palpate_validation.check import failures, table, write
 
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     unknown = [name for name in only or () if name not in SECTIONS]
     if unknown:
         refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
@@ -54,8 +53,8 @@ def validate(
             sections.append(run_section(name))
             write(sections, out)  # an error or Ctrl-C in a later section keeps these
     wide_console(150).print(table(sections))
-    console.print(f"plots and figures in {out}", highlight=False)
+    console.print(f"plots and figures in {out}")
     missed = failures(sections)
     if missed:
-        console.print(f"[bold red]{len(missed)} outside their bounds:[/] {'; '.join(c.name for c in missed)}", highlight=False)
+        console.print(f"{len(missed)} outside their bounds: {'; '.join(c.name for c in missed)}", style="bold red")
         raise typer.Exit(ExitStatus.FAILED)

@@ -20,10 +20,9 @@ Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next t
 @app.command()
 def check(arm: Name) -> None:
     """Say what an arm has, and what is missing or impossible, each with its link or joint. Starts nothing."""
-    from rich.console import Console
     from rich.table import Table
 
-    from palpate.console import say
+    from palpate.console import SteadyConsole, say
     from palpate_errors import ExitStatus
     from palpate_models.robot.arm import check_arm
 
@@ -40,12 +39,12 @@ def check(arm: Name) -> None:
     for k, (name, low, high, speed, torque, home) in enumerate(zip(found.joint_names, *limits, strict=True)):
         mass = found.inertias[k + 1].mass
         table.add_row(name, f"{low:.2f} to {high:.2f}", f"{speed:.2f}", f"{torque:.0f}", f"{home:.2f}", f"{mass:.2f}")
-    console = Console()
+    console = SteadyConsole()
     console.print(table)
     elbow, _ = found.elbow
     shapes = sum(map(len, found.capsules))
     parts = f"flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes"
-    console.print(f"{found.joints} joints, {parts}", highlight=False)
+    console.print(f"{found.joints} joints, {parts}")
 
 
 @app.command()
@@ -57,10 +56,9 @@ def place(
 ) -> None:
     """Find where the base should stand to reach a scenario's region, and draw which targets it reaches."""
     import numpy as np
-    from rich.console import Console
 
     from palpate.arm.placement import PLACEMENT, best_placement, describe, scan_targets
-    from palpate.console import say
+    from palpate.console import SteadyConsole, say
     from palpate.run.inputs import check_usable
     from palpate_models.robot.arm import arm_of
     from palpate_models.scenario.load import exam_input
@@ -68,22 +66,22 @@ def place(
     from palpate_planning.strokes.plan import look_postures
 
     chosen = check_usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
-    console = Console()
-    with Console(stderr=True).status("optimising: about a minute"):
+    console = SteadyConsole()
+    with SteadyConsole(stderr=True).status("optimising: about a minute"):
         robot = best_placement(chosen)
         targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, PLACEMENT.raised_m)]
         home = arm_of(robot).home_rad
         deep, raised = (plan_redundancy(robot, *pair, home) for pair in targets)
-    console.print(f"pressed: {describe(robot, deep)}", highlight=False, soft_wrap=True)
-    console.print(f"raised:  {describe(robot, raised)}", highlight=False, soft_wrap=True)
+    console.print(f"pressed: {describe(robot, deep)}", soft_wrap=True)
+    console.print(f"raised:  {describe(robot, raised)}", soft_wrap=True)
     x, y = robot.base_xy_m
-    console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}", highlight=False)
-    console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}", highlight=False)
+    console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}")
+    console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}")
     _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
     at = chosen.model_copy(update={"robot": robot})
     if not look_postures(exam_input(at)):
         say("no posture to look from is free of collisions here: give another home_rad, or move the base by hand")
-    console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
+    console.print(f"drawn in {out}", soft_wrap=True)
 
 
 def _touching(arm: str) -> list[str]:

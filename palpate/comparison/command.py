@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from palpate.console import number, output_folder, print_json, say, table
+from palpate.console import SteadyConsole, number, output_folder, print_json, say, table
 
 
 def compare(
@@ -33,8 +33,6 @@ def compare(
       palpate compare outcomes.csv                    real against simulated outcomes
     """
     from json import dumps
-
-    from rich.console import Console
 
     from palpate.comparison import compare as comparing
     from palpate.comparison.outcomes import draw_outcomes, read_outcomes, sim_to_real
@@ -65,6 +63,6 @@ def compare(
         shown = "" if isinstance(value, tuple) else str(value) if isinstance(value, bool) else number(value)
         band = value if isinstance(value, tuple) else band
         rows.add_row(name.removesuffix("_90"), shown, "" if band is None else f"{number(band[0])} to {number(band[1])}")
-    console = Console()
+    console = SteadyConsole()
     console.print(rows)
-    console.print(f"written to {out}: compare.json, compare.png", highlight=False, soft_wrap=True)
+    console.print(f"written to {out}: compare.json, compare.png", soft_wrap=True)

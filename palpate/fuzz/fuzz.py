@@ -227,7 +227,7 @@ def fuzz(
         done = campaign(chosen, FuzzPlan(inputs, seed, seconds), display.show)
     finds = [find for result in done.values() for find in result.finds]
     for find in finds:
-        console.print(f"{find.target} {find.error}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
+        console.print(f"{find.target} {find.error}\n  {find.data.hex()}", soft_wrap=True)
     figures = table("target", ">inputs", ">refused", ">finds", ">processor s", ">peak MB")
     for name, result in done.items():
         rest = (result.inputs, result.refused, result.found, round(result.seconds), result.peak_mb)

@@ -46,7 +46,7 @@ def dashboard(
     from palpate_bus.runs.announcement import named_runs
     from palpate_dashboard.picture import film, take
 
-    console = SteadyConsole(stderr=True, highlight=False, soft_wrap=True)
+    console = SteadyConsole(stderr=True, soft_wrap=True)
     try:
         if picture or film_file:
             if source is None:

@@ -64,7 +64,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
             say(f"{bus.title}: {error}")
         else:
             text = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
-            console.print(text, highlight=False, soft_wrap=True)
+            console.print(text, soft_wrap=True)
     if failed:
         raise typer.Exit(ExitStatus.FAILED)
 

@@ -47,7 +47,7 @@ def assess(
     else:
         from palpate.report.results import print_findings
 
-        console = SteadyConsole(highlight=False, soft_wrap=True)
+        console = SteadyConsole(soft_wrap=True)
         print_findings(console, report)
         console.print(f"to read: {page}")
     if not report.assessed:

@@ -251,7 +251,7 @@ def write_reference(file: Path, service: str, scenario: Path | None, start: int,
         make_reference(case, target, start, case.end if end is None else end)
 
     run_guarded(f"--service {service}", write, math.inf)
-    SteadyConsole(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
+    SteadyConsole(stderr=True).print(f"{target}: {target.stat().st_size} bytes")
 
 
 def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:

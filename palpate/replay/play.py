@@ -203,7 +203,7 @@ def play(
     console = SteadyConsole(stderr=True)
     recording = open_recording(file)
     with Player(recording, rate, topics, listen, drive) as player:
-        console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends", highlight=False)
+        console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends")
         last = recording.last - player.origin
         if start > last:
             raise UserError(f"--from {start / NS:g}: {file} ends at {last / NS:.3f} s")

@@ -207,7 +207,7 @@ def _level(report: Report) -> str:
 def print_findings(console: Console, report: Report) -> None:
     """Print unassessed areas, the findings as a table, and their scores in a line."""
     if unknown := describe_unassessed(report):
-        console.print(unknown.rstrip(), highlight=False, soft_wrap=True)
+        console.print(unknown.rstrip(), soft_wrap=True)
     if report.findings:
         table = Table("finding", "where (x, y)", "area", "apparent stiffness", "90 % band", "confidence", box=None)
         for f in report.findings:
@@ -221,28 +221,24 @@ def print_findings(console: Console, report: Report) -> None:
             )
         console.print(table)
         if whom := rows.of_whom(report):
-            console.print(whom.rstrip(), highlight=False)
+            console.print(whom.rstrip())
     elif report.assessed:
         console.print("no finding" if report.failure is None else "no finding in the scanned part")
     else:
         console.print(f"not assessed: {report.samples} samples are too few for a map")
     if others := rows.other_causes(report.candidates):
-        console.print(others.rstrip(), highlight=False, soft_wrap=True)
+        console.print(others.rstrip(), soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
-        console.print(
-            f"search: {searched['presses']} presses in {searched['seconds']:.0f} s; {searched['ended']}", highlight=False
-        )
+        console.print(f"search: {searched['presses']} presses in {searched['seconds']:.0f} s; {searched['ended']}")
     print_scores(console, report)
 
 
 def print_scores(console: Console, report: Report) -> None:
     """Print the scores against the truth in a line, if anything was assessed."""
     if report.scores is not None and report.assessed:
-        console.print(
-            f"against the truth{clean_world_note(report)}: {scores_text(report.scores)}", highlight=False, soft_wrap=True
-        )
+        console.print(f"against the truth{clean_world_note(report)}: {scores_text(report.scores)}", soft_wrap=True)
     elif report.truth is not None and not report.truth.felt and report.assessed:
-        console.print("not scored: a copy of this tissue cannot be pressed for the truth", highlight=False)
+        console.print("not scored: a copy of this tissue cannot be pressed for the truth")
 
 
 def clean_world_note(report: Report) -> str:

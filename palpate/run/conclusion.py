@@ -48,13 +48,13 @@ def conclude(
     if page is not None and (trouble or not quiet):
         megabytes = megabytes_of(page.parent)
         size = f"{megabytes:.0f} MB" if megabytes >= 1 else "under 1 MB"
-        console.print(f"to read: {page} ({size} in {page.parent})", highlight=False, soft_wrap=True)
+        console.print(f"to read: {page} ({size} in {page.parent})", soft_wrap=True)
     if trouble:
         say(trouble)
     if result.failure:
         say(f"the run failed: {result.failure} (logs in {folder / 'logs'}){_hold_text(result)}")
         if (folder / RECORDING).is_dir() and not quiet:
-            console.print(f"to examine the remaining targets: palpate run --resume {folder}", highlight=False, soft_wrap=True)
+            console.print(f"to examine the remaining targets: palpate run --resume {folder}", soft_wrap=True)
     if result.failure or trouble:
         raise typer.Exit(ExitStatus.FAILED)
 

@@ -50,7 +50,7 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
     """
     _refuse_contradictions(scenario, options)
     console = SteadyConsole(stderr=True)
-    absent = Absent(tuple(options.without or ()), options.wait, partial(console.print, highlight=False, soft_wrap=True))
+    absent = Absent(tuple(options.without or ()), options.wait, partial(console.print, soft_wrap=True))
     observers = _observers(scenario, options)
     groups = placement((*workers(scenario), *observers), options.group or (), options.processes)
     folder = options.out or usual_folder(scenario.name)
@@ -95,7 +95,7 @@ def _announce(console: Console, scenario: Scenario, options: RunOptions, folder:
     if options.record != "none" and (reason := _missing_for_dashboard(scenario)):
         hints.append(f"for palpate dashboard, now or of the finished run, {reason}")
     for hint in hints:
-        console.print(hint, style="dim", highlight=False, soft_wrap=True)
+        console.print(hint, style="dim", soft_wrap=True)
 
 
 def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:

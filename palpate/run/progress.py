@@ -129,7 +129,7 @@ class RunDisplay:
     def show(self, progress: RunProgress) -> None:
         """Show the state of the run."""
         for sentence in progress.trouble[self._troubles_shown :]:
-            self._console.print(sentence, style="bold red", highlight=False, soft_wrap=True)
+            self._console.print(sentence, style="bold red", soft_wrap=True)
         self._troubles_shown = len(progress.trouble)
         self._pass_requests(progress)
         exam = progress.collected.exam
@@ -164,13 +164,13 @@ class RunDisplay:
         if self._bar.disable or progress.request is None:
             return
         if not self.begun and not self._keys.attached and self._keys.__enter__().attached:
-            self._console.print(HINT, style="dim", highlight=False)
+            self._console.print(HINT, style="dim")
         for word in self._keys.read_requests():
             progress.request(WORDS[word], "a key of palpate run")
-            self._console.print(f"{word}: passed on", highlight=False)
+            self._console.print(f"{word}: passed on")
         supervisor = progress.collected.supervisor
         stopped = supervisor.reason if supervisor is not None and supervisor.level else ""
         if stopped != self._stopped:
             self._stopped = stopped
             text = Text(f"stopped: {stopped}", "bold red") if stopped else "released"
-            self._console.print(text, highlight=False, soft_wrap=True)
+            self._console.print(text, soft_wrap=True)

@@ -107,7 +107,7 @@ def run(  # noqa: PLR0913 - the options of a command
     folder, manifest = open_folder(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
     _examine(console, folder, own, (workers, scheduler), runs)
     if shard and folder.missing(cases):
-        console.print(f"shard {shard} is done; when all are: palpate study merge DIR...", highlight=False)
+        console.print(f"shard {shard} is done; when all are: palpate study merge DIR...")
     else:
         _conclude(folder, manifest)
 
@@ -165,16 +165,16 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
 
     todo = len(folder.missing(cases))
     if len(cases) > todo:
-        console.print(f"{len(cases) - todo} of {len(cases)} cases are done already", highlight=False)
+        console.print(f"{len(cases) - todo} of {len(cases)} cases are done already")
     if not todo:
         return
     finished = count(1)
     try:
         opened = open_workers(where[0] or count_cores(), where[1])
         with opened as workers, CaseDisplay(console, console.quiet, "cases") as display:
-            console.print(f"{todo} cases, {workers.count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
+            console.print(f"{todo} cases, {workers.count} at a time, into {folder.path}", soft_wrap=True)
             if workers.client.dashboard_link:
-                console.print(f"workers: {workers.client.dashboard_link}", style="dim", highlight=False, soft_wrap=True)
+                console.print(f"workers: {workers.client.dashboard_link}", style="dim", soft_wrap=True)
             display.show(0, todo, "")
 
             def done(outcome: Outcome) -> None:
@@ -197,15 +197,15 @@ def _conclude(folder: Folder, manifest: Manifest) -> None:
     except UserError as error:
         fail(error)
     out = SteadyConsole()
-    out.print(_result(found), highlight=False, soft_wrap=True)
+    out.print(_result(found), soft_wrap=True)
     incomplete = [outcome for outcome in outcomes if not outcome.completed]
     for outcome in incomplete[:SHOWN]:
         tried = f" (attempts: {'; '.join(outcome.failures)})" if outcome.status == "failed" else ""
         reason = outcome.why or "nothing was assessed"
-        out.print(f"{outcome.case.label}: {reason}{tried}", highlight=False, soft_wrap=True)
+        out.print(f"{outcome.case.label}: {reason}{tried}", soft_wrap=True)
     if len(incomplete) > SHOWN:
-        out.print(f"... and {len(incomplete) - SHOWN} more that did not complete", highlight=False)
-    out.print(f"page: {folder.path / 'study.html'}", highlight=False, soft_wrap=True)
+        out.print(f"... and {len(incomplete) - SHOWN} more that did not complete")
+    out.print(f"page: {folder.path / 'study.html'}", soft_wrap=True)
     if found.failed:
         raise typer.Exit(ExitStatus.FAILED)
 
