@@ -24,17 +24,7 @@ from palpate_bus.contract import Contract, Topic
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import MS, UNIX_NS
-from palpate_bus.monitor.health import (
-    TUNING,
-    BusTime,
-    SeenViolation,
-    Stream,
-    TopicHealth,
-    Violation,
-    bus_time,
-    is_due,
-    timing_violations,
-)  # fmt: skip
+from palpate_bus.monitor import health
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
 from palpate_bus.wire.transport import subscribe, try_decode
@@ -46,14 +36,14 @@ class Monitor:
     def __init__(self, contract: Contract, rate: float | None = None) -> None:
         self.contract = contract
         self.rate = rate
-        self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
+        self.active: dict[tuple[str, str, Kind, str], health.SeenViolation] = {}
         """Every violation, by (topic, sender, kind, field)."""
-        self.time = BusTime(0.0, 0, None)
+        self.time = health.BusTime(0.0, 0, None)
         """Progress of the bus time as of the last check."""
         self.listening: frozenset[str] = frozenset(contract.topics)
         """Subscribed topics; silence of the others is not a violation."""
-        self._kept: dict[str, TopicHealth] = {}
-        self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in contract.topics}
+        self._kept: dict[str, health.TopicHealth] = {}
+        self._streams: dict[str, dict[bytes, health.Stream]] = {name: {} for name in contract.topics}
         self._checkers = {name: Checker(topic) for name, topic in contract.topics.items()}
         self._decoders = {name: codec.decoder(topic.type) for name, topic in contract.topics.items()}
         self._nodes: dict[bytes, str] = {}
@@ -61,7 +51,7 @@ class Monitor:
         """Senders that have left the bus."""
         self._publishers: dict[str, set[str]] = {}
         self._since: dict[tuple[str, str], float] = {}
-        self._news: list[Violation] = []
+        self._news: list[health.Violation] = []
 
     def listen(self, names: Iterable[str], now: float) -> None:
         """Set the subscribed topics. The last findings on the others are kept."""
@@ -105,7 +95,7 @@ class Monitor:
         topic = self.contract.topics[name]
         stream = self._streams[name].get(gid)
         if stream is None:
-            stream = self._streams[name][gid] = Stream(self._sender(gid), now, sequence=sequence - 1)
+            stream = self._streams[name][gid] = health.Stream(self._sender(gid), now, sequence=sequence - 1)
         if gid in self._nodes:
             stream.sender = self._nodes[gid]
         stream.count += 1
@@ -134,7 +124,7 @@ class Monitor:
         topic = self.contract.topics[name]
         self._note(topic, self._sender(gid), Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
 
-    def check(self, now: float, wall: int) -> list[Violation]:
+    def check(self, now: float, wall: int) -> list[health.Violation]:
         """Check rates and ages; return the violations that are new. `wall` is the wall time [ns]. Call it often."""
         for streams in self._streams.values():
             for stream in streams.values():
@@ -143,26 +133,26 @@ class Monitor:
         rows = self.contract.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
         present = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
-        self.time = bus_time(present, self.rate)
+        self.time = health.bus_time(present, self.rate)
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for problem in timing_violations(topic, stream, self.time, self.rate, now):
+                    for problem in health.timing_violations(topic, stream, self.time, self.rate, now):
                         self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._check_silent(now)
         news, self._news = self._news, []
         return news
 
-    def health(self) -> list[TopicHealth]:
+    def health(self) -> list[health.TopicHealth]:
         """Return the health of every topic, in the contract's order."""
         return [self._health(topic) for topic in self.contract.topics.values()]
 
-    def _health(self, topic: Topic) -> TopicHealth:
+    def _health(self, topic: Topic) -> health.TopicHealth:
         streams = [stream for stream in self._streams[topic.name].values() if stream.window]
         passed = [stream.passed() for stream in streams]
         seconds = max((p.seconds for p in passed), default=0.0)
         kept = self._kept.get(topic.name)
-        if kept is not None and seconds < TUNING.grace_s:  # as of its last subscription, with its present senders
+        if kept is not None and seconds < health.TUNING.grace_s:  # as of its last subscription, with its present senders
             senders = sorted(self._publishers.get(topic.name, set()))
             return kept._replace(senders=tuple(senders), violations=self._violations(topic))
         messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
@@ -171,10 +161,10 @@ class Monitor:
         alive: bool | None = None
         if topic.latched and senders:
             alive = bool(streams)
-        elif topic.periodic and senders and self.time.progress and seconds >= TUNING.grace_s:
+        elif topic.periodic and senders and self.time.progress and seconds >= health.TUNING.grace_s:
             alive = messages > 0
         rate = messages / seconds if seconds else 0.0
-        return TopicHealth(
+        return health.TopicHealth(
             topic, tuple(senders), alive, sum(stream.count for stream in streams), rate,
             max(own, default=None),
             min((stream.ages[-1] for stream in streams if stream.ages), default=None),
@@ -191,15 +181,15 @@ class Monitor:
         return self._nodes.get(gid, f"unknown sender {gid.hex()[:8]}")
 
     def _note(self, topic: Topic, sender: str, kind: Kind, expected: str, got: str, now: float, path: str = "") -> None:
-        key, violation = (topic.name, sender, kind, path), Violation(topic.name, sender, kind, expected, got, path)
+        key, violation = (topic.name, sender, kind, path), health.Violation(topic.name, sender, kind, expected, got, path)
         if key in self.active:
             seen = self.active[key]
             seen.violation, seen.last, seen.count = violation, now, seen.count + 1
         else:
-            self.active[key] = SeenViolation(violation, now, now)
+            self.active[key] = health.SeenViolation(violation, now, now)
             self._news.append(violation)
 
-    def _check_sequence(self, topic: Topic, stream: Stream, sequence: int, now: float) -> None:
+    def _check_sequence(self, topic: Topic, stream: health.Stream, sequence: int, now: float) -> None:
         missing = sequence - stream.sequence - 1
         if missing > 0:
             stream.missing += missing
@@ -209,7 +199,7 @@ class Monitor:
             self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}", f"{sequence} again", now)
         stream.sequence = max(stream.sequence, sequence)
 
-    def _check_stamp(self, topic: Topic, stream: Stream, sequence: int, stamp: int, now: float) -> None:
+    def _check_stamp(self, topic: Topic, stream: health.Stream, sequence: int, stamp: int, now: float) -> None:
         if stream.stamp is not None and stamp < stream.stamp:
             self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: backwards", now)
         elif topic.periodic and self.rate is None and stamp != (sequence - 1) * topic.period:
@@ -223,10 +213,10 @@ class Monitor:
             if name not in self.listening:
                 continue
             active = {stream.sender for stream in self._streams[name].values()}
-            due = (topic.periodic and is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
+            due = (topic.periodic and health.is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
             for node in nodes - active:
                 waited = now - self._since[name, node]
-                if waited > TUNING.window_s and due:
+                if waited > health.TUNING.window_s and due:
                     expected = "its latched message" if topic.latched else f"{1000 / topic.period_ms:g} Hz"
                     self._note(topic, node, Kind.SILENT, expected, f"nothing for {waited:.1f} s", now)
 
@@ -275,7 +265,7 @@ class LiveMonitor:
             self._subscribers[name] = subscribe(self._session, key, zenoh.handlers.FifoChannel(ROOM), history=latched)
         self.monitor.listen(chosen, monotonic())
 
-    def poll(self) -> list[Violation]:
+    def poll(self) -> list[health.Violation]:
         """Process received messages and return new violations."""
         now = monotonic()
         self.graph.changes()

@@ -8,16 +8,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import PalpationTargets, SurfaceCorrection, SurfaceMotion
+from palpate_bus.messages import PalpationTargets, SurfaceCorrection, SurfaceMotion, geometry
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import (
-    cloud_message,
-    depth_in_metres,
-    mesh_message,
-    point_message,
-    pose_of_frame,
-    vector_message,
-)
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import apply, inverse
@@ -80,12 +72,12 @@ class PerceptionService(Service):
         stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
         camera = _intrinsics(inbox, "camera/follow/camera_info", image)
         try:
-            depth = depth_in_metres("camera/follow/depth", image)
+            depth = geometry.depth_in_metres("camera/follow/depth", image)
         except ValueError:  # unknown encoding: ignore the image
             depth, camera = np.empty((0, 0), np.float32), None
         q = None if status is None else np.asarray(status.position, np.float64)
         wall = self._follower.take(stamp / NS, depth, camera, q)
-        state, shift = getattr(SurfaceMotion, wall.state.name), vector_message(wall.shift)
+        state, shift = getattr(SurfaceMotion, wall.state.name), geometry.vector_message(wall.shift)
         return SurfaceMotion(header(stamp, MOTION_FRAME), state, wall.displacement, wall.forecast, wall.sigma, shift)
 
     def _correction(self, t: int) -> dict[str, Message | list[Message]]:
@@ -129,12 +121,12 @@ class PerceptionService(Service):
         perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode, self._follower.shift)
         self._last, self._corrected = perceived, t
         outbox: dict[str, Message | list[Message]] = {
-            "perception/points": cloud_message(header(t, FRAME), perceived.cloud.p_W),
+            "perception/points": geometry.cloud_message(header(t, FRAME), perceived.cloud.p_W),
             "perception/targets": targets(t, perceived),
         }
         if perceived.mesh is not None:
             mesh = perceived.mesh
-            outbox["perception/surface"] = mesh_message(header(t, FRAME), mesh.p_W, mesh.n_W, mesh.triangles, mesh.lifts)
+            outbox["perception/surface"] = geometry.mesh_message(header(t, FRAME), mesh.p_W, mesh.n_W, mesh.triangles, mesh.lifts)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
@@ -167,7 +159,7 @@ class PerceptionService(Service):
                 if burst.wrong:
                     continue
                 try:
-                    depth = depth_in_metres(IMAGE, image)
+                    depth = geometry.depth_in_metres(IMAGE, image)
                 except ValueError as error:  # of another encoding, or too few bytes
                     burst.wrong = str(error)
                     continue
@@ -202,7 +194,7 @@ def _intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
     Raises ValueError for a quaternion that is not of unit length.
     """
     info, pose = inbox.latest(topic), inbox.latest("tf_static")
-    X_WC = None if pose is None else pose_of_frame(pose, image.header.frame_id, FRAME)
+    X_WC = None if pose is None else geometry.pose_of_frame(pose, image.header.frame_id, FRAME)
     if info is None or X_WC is None:
         return None
     return Intrinsics(np.array(info.k, np.float64).reshape(3, 3), X_WC, (int(info.height), int(info.width)))
@@ -229,6 +221,6 @@ def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
 def targets(t: int, perceived: Perceived) -> Message:
     """Return `palpation_msgs/PalpationTargets` in world."""
     found = perceived.targets
-    points, normals = [point_message(p) for p in found.p_W], [vector_message(n) for n in found.n_W]
+    points, normals = [geometry.point_message(p) for p in found.p_W], [geometry.vector_message(n) for n in found.n_W]
     facts = (perceived.sigma, perceived.frames, perceived.coverage, perceived.reason, perceived.message)
     return PalpationTargets(header(t, FRAME), points, normals, found.line, *facts)

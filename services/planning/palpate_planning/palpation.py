@@ -18,25 +18,11 @@ import numpy as np
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import ExamInput
+from palpate_planning import stroke
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
 from palpate_planning.reasons import Cause, Reason
-from palpate_planning.stroke import (
-    PRESSING,
-    PUSHING,
-    STROKE,
-    Descent,
-    Stages,
-    StrokeInput,
-    StrokeStage,
-    clearance,
-    follow,
-    is_limited,
-    is_steady,
-    lift,
-    press,
-    travel,
-)
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
 from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_REQUEST, FOR_WALL, StrokeWaits, Wait
@@ -103,7 +89,7 @@ class Palpation:
         self._number = -1
         self.stage = StrokeStage.WAIT
         self._motion = StrokeMotion(exam, limits, known.robot, period_s, wall)
-        self.descent = Descent(self._motion, exam.depth_m, strokes)
+        self.descent = stroke.Descent(self._motion, exam.depth_m, strokes)
         self.looked_again = False
         """True if the surface was scanned again because no tissue was felt."""
         self._blind_places = 0
@@ -176,7 +162,7 @@ class Palpation:
     def pause(self) -> None:
         """Lift off along the normal and wait there for `resume`."""
         self.recovery.paused = True
-        if self.stage in PRESSING:
+        if self.stage in stroke.PRESSING:
             stop = self._motion.along.position + self._motion.stopping_distance
             self.recovery.resume_at = min(stop, self._motion.segment.path.length)
             self._interrupt()
@@ -232,7 +218,7 @@ class Palpation:
         descent, recovery = self.descent, self.recovery
         descent.taring, descent.touched = False, None
         self.stage = self._stages.send(
-            StrokeInput(
+            stroke.StrokeInput(
                 t,
                 contact,
                 gate_open=self._watch.open,
@@ -250,44 +236,44 @@ class Palpation:
     def _regulate(self, contact: ContactMeasurement) -> None:
         """Regulate the depth towards the target of the stage."""
         in_contact = contact.touching and self.stage is not StrokeStage.LIFT
-        pushing = self.stage in PUSHING and not (self.recovery.paused or self.recovery.ending)
+        pushing = self.stage in stroke.PUSHING and not (self.recovery.paused or self.recovery.ending)
         self._motion.regulate(contact, in_contact=in_contact, pushing=pushing)
 
     # --- the sequence -------------------------------------------------------------------------------------------------
 
-    def _remaining(self) -> Stages[None]:
+    def _remaining(self) -> stroke.Stages[None]:
         """Return the segments from the next one on."""
         while self._number + 1 < len(self._segments) or (self.more and (yield from self._wait())):
             self._number += 1
             segment = self._segments[self._number]
             self._motion.start(segment)
             if segment.free is not None:
-                yield from follow(self._motion)
+                yield from stroke.follow(self._motion)
             elif segment.contact:
                 yield from self._press()
                 yield from self._lift()
             else:
-                yield from travel(self._motion, segment.path.length)
+                yield from stroke.travel(self._motion, segment.path.length)
         yield from _done()
 
-    def _after_interruption(self) -> Stages[None]:
+    def _after_interruption(self) -> stroke.Stages[None]:
         """Return the lift after an interruption, the rest of the segment and the remaining ones."""
         yield from self._lift()
         yield from self._remaining()
 
-    def _wait(self) -> Stages[bool]:
+    def _wait(self) -> stroke.Stages[bool]:
         """Wait above the wall; return True if a further segment follows."""
         while True:
             now = yield StrokeStage.WAIT
-            self._motion.depth_axis.step(-SEGMENTS.hover_m, STROKE.lift_mps)
+            self._motion.depth_axis.step(-SEGMENTS.hover_m, stroke.STROKE.lift_mps)
             if self.recovery.ending:
                 return False
             if not now.paused and (len(self._segments) > self._number + 1 or not self.more):
                 return len(self._segments) > self._number + 1
 
-    def _press(self) -> Stages[None]:
+    def _press(self) -> stroke.Stages[None]:
         """Press along the present segment, from where the arm is."""
-        cause = yield from press(self._motion, self.descent)
+        cause = yield from stroke.press(self._motion, self.descent)
         self._blind_places = self._blind_places + 1 if cause.reason is Reason.NO_TISSUE else 0
         if cause.reason is Reason.NO_TISSUE:
             self._miss(cause)
@@ -304,18 +290,18 @@ class Palpation:
             text = f"{cause.text}, at {self._blind_places} places: the surface or the force sensor is wrong"
             self.recovery.give_up(cause._replace(text=text))
 
-    def _lift(self) -> Stages[None]:
+    def _lift(self) -> stroke.Stages[None]:
         """Lift off; take the stroke up again where it was interrupted, else move above the wall to the end of its path."""
         motion, recovery = self._motion, self.recovery
         while True:
-            yield from lift(motion, self._height)
+            yield from stroke.lift(motion, self._height)
             if recovery.ending:
                 yield from _done()
             if recovery.resume_at is None:
                 if not motion.ended:
-                    yield from travel(motion, motion.segment.path.length)
+                    yield from stroke.travel(motion, motion.segment.path.length)
                 return
-            yield from travel(motion, recovery.resume_at)
+            yield from stroke.travel(motion, recovery.resume_at)
             recovery.resume_at = None
             yield from self._press()
 
@@ -326,10 +312,10 @@ class Palpation:
         if self.recovery.ending or not certain or not following:
             return self._motion.free_height(t)
         if self.recovery.resume_at is not None:
-            return STROKE.hop_height_m
+            return stroke.STROKE.hop_height_m
         if following[0].free is not None:
             return self._motion.free_height(t)
-        return clearance(wall.at(wall.perceived.xy(following[0].path.p[-1]), t).sigma)
+        return stroke.clearance(wall.at(wall.perceived.xy(following[0].path.p[-1]), t).sigma)
 
     def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
         motion, descent = self._motion, self.descent
@@ -338,14 +324,14 @@ class Palpation:
             return PalpationStep(setpoint, self.stage, -SEGMENTS.hover_m, False, False, int(motion.segment.path.targets[-1]))
         if self.recovery.displacement is not None:
             setpoint = self.recovery.displacement.move(setpoint)
-        limited = is_limited(self.stage, motion)
-        steady = contact.touching and self._watch.open and is_steady(self.stage, motion, limited=limited)
+        limited = stroke.is_limited(self.stage, motion)
+        steady = contact.touching and self._watch.open and stroke.is_steady(self.stage, motion, limited=limited)
         depth = motion.regulation.reference_m
         return PalpationStep(setpoint, self.stage, depth, steady, limited, motion.target, descent.taring, descent.touched)
 
     # --- interruptions ------------------------------------------------------------------------------------------------
 
-    def _continue_with(self, stages: Stages[None]) -> None:
+    def _continue_with(self, stages: stroke.Stages[None]) -> None:
         self._stages = stages
         self.stage = next(stages)
 
@@ -356,16 +342,16 @@ class Palpation:
     def _check_force(self, contact: ContactMeasurement) -> None:
         """Lift off at the soft-stop force and skip the targets there; before a sudden force, and press there again."""
         foreseen = self._forces.step(contact.load)
-        if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
+        if contact.load > self._limits.force_soft_stop_n and self.stage in stroke.PRESSING:
             self.recovery.soft_stop(contact.load, self._motion.segment, self._motion.along.position)
             self._interrupt()
-        elif foreseen > self._limits.force_working_n and self.stage in PRESSING:
+        elif foreseen > self._limits.force_working_n and self.stage in stroke.PRESSING:
             self.recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, SURGED)
             self._interrupt()
 
     def _check_elbow(self, contact: ContactMeasurement) -> None:
         """End the strokes before the arm would have to stretch, in a stroke or on the path to the next."""
-        followed = self.stage in PRESSING or (self.stage is StrokeStage.TRANSFER and self._motion.segment.free is None)
+        followed = self.stage in stroke.PRESSING or (self.stage is StrokeStage.TRANSFER and self._motion.segment.free is None)
         if followed and self._motion.bend_ahead < (needed := self._motion.bend_needed(contact.q)):
             self.bend_needed = needed
             self.leave(STRETCHED)
@@ -379,7 +365,7 @@ class Palpation:
             self.leave(HIDDEN)
         elif self._watch.ended:
             self.leave(self._watch.ended)
-        elif self._watch.spoiled and self.stage in PRESSING:
+        elif self._watch.spoiled and self.stage in stroke.PRESSING:
             back = TUNING.repeat_m if sliding else 0.0
             if self._watch.leaps:  # a cough or deep breath: only the time of waiting bounds the repeats
                 self.recovery.take_up(self._motion.along.position, back)
@@ -438,6 +424,6 @@ def measures_targets(segment: Segment) -> bool:
     return segment.contact and not segment.touch
 
 
-def _done() -> Stages[None]:
+def _done() -> stroke.Stages[None]:
     while True:
         yield StrokeStage.DONE

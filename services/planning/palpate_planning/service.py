@@ -8,15 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import (
-    CameraTrigger,
-    OperatorRequest,
-    PalpationTargets,
-    RobotStatus,
-    SearchRequest,
-    SupervisorState,
-    SurfaceMotion,
-)
+from palpate_bus.messages import CameraTrigger, PalpationTargets, RobotStatus, SearchRequest, SupervisorState, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import MS, header, nanoseconds
@@ -191,7 +183,7 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
     wrong = None if state is None or state.level == SupervisorState.LEVEL_OK else state
     final = wrong is not None and wrong.cause in NOT_RELEASABLE
     for request in requests:
-        if request.request == OperatorRequest.STOP:
+        if request.request == request.STOP:
             return ArmStop(Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), final=final)
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         source = wrong if wrong is not None and final else status
@@ -209,7 +201,7 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
 
 def _end(requests: tuple[Message, ...]) -> Cause:
     """Return the cause if an operator has just ended the examination."""
-    ends = [request for request in requests if request.request == OperatorRequest.END]
+    ends = [request for request in requests if request.request == request.END]
     return Cause(Reason.OPERATOR_END, f"ended by the operator: {ends[0].reason}") if ends else NO_CAUSE
 
 

@@ -36,17 +36,8 @@ from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import BRAKE_NMS, EmulatedArm, serve
-from palpate_robot.backends.lbr.port import (
-    FT_TOPIC,
-    NAMESPACE,
-    STATE,
-    TORQUE_COMMAND,
-    ClientCommandMode,
-    ConnectionQuality,
-    LBRState,
-    SafetyState,
-    SessionState,
-)
+from palpate_robot.backends.lbr import port
+from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
 PERIODS_MS: Final = range(1, 101)
 JOINT_IMPEDANCE: Final = 2
@@ -192,14 +183,14 @@ class Emulator(EmulatedArm):
         """Return LBRState at wall time `now` [ns]."""
         session, drive = self.session, self._applied
         ipo = self.measured if session.state >= SessionState.COMMANDING_WAIT else np.full(7, np.nan)
-        return LBRState(
+        return port.LBRState(
             sample_time=self.period_ms * 1e-3,
             session_state=int(session.state),
             connection_quality=int(session.quality),
-            safety_state=int(SafetyState.NORMAL_OPERATION),
+            safety_state=int(port.SafetyState.NORMAL_OPERATION),
             operation_mode=2,
             drive_state=1,
-            client_command_mode=int(ClientCommandMode.TORQUE),
+            client_command_mode=int(port.ClientCommandMode.TORQUE),
             overlay_type=1,
             control_mode=JOINT_IMPEDANCE,
             time_stamp_sec=now // 1_000_000_000,
@@ -216,9 +207,9 @@ class Emulator(EmulatedArm):
 
 def serve_graph(emulator: Emulator, node: RosNode) -> None:
     """Run in wall-clock time until a signal; after the session ends the arm stands and no state is published."""
-    states = node.publisher(f"{NAMESPACE}/state", STATE)
-    wrenches = node.publisher(FT_TOPIC, WRENCH)
-    commands = node.subscription(f"{NAMESPACE}/command/torque", TORQUE_COMMAND)
+    states = node.publisher(f"{port.NAMESPACE}/state", port.STATE)
+    wrenches = node.publisher(port.FT_TOPIC, WRENCH)
+    commands = node.subscription(f"{port.NAMESPACE}/command/torque", port.TORQUE_COMMAND)
     reported = ""
 
     def cycle(stamp: int) -> None:
