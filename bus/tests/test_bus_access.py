@@ -13,9 +13,10 @@ from waiting import wait_until
 from palpate_bus.contract import contract
 from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, list_watched
 from palpate_bus.security.keys import HOSTS, KeysError, certificates, init, members, read
+from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import message_key, topic_key
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, open_session, zenoh_config
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, free_port, open_session, zenoh_config
 
 RULES = contract()
 CONTROL = message_key("palpate/control", "palpation_msgs/msg/RunControl", 0)

@@ -14,8 +14,8 @@ import zenoh
 from waiting import wait_until
 
 from palpate_bus.contract import parse, with_periods
-from palpate_bus.settings import Settings
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
+from palpate_bus.settings import BusConfigError, Settings
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session, session, zenoh_config
 
 
 def received(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = b"x", key: str = "test/key") -> bytes | None:

@@ -27,9 +27,9 @@ from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init, read
-from palpate_bus.settings import Settings, variable
+from palpate_bus.settings import BusConfigError, Settings, variable
 from palpate_bus.wire.rmw import make_key
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, mesh, open_session
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, free_port, mesh, open_session
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_inputs import read_yaml

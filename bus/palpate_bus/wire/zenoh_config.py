@@ -50,11 +50,7 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.settings import (
-    BusConfigError as BusConfigError,  # noqa: PLC0414  # others import it from here, too
-    Settings,
-    variable,
-)
+from palpate_bus.settings import BusConfigError, Settings, variable
 
 UNIX_PATH_MAX_BYTES = 107  # sun_path without its NUL on Linux
 

@@ -4,8 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_bus.settings import Settings
-from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_bus.settings import BusConfigError, Settings
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario

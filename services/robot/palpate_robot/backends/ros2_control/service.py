@@ -11,8 +11,7 @@ import numpy as np
 
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
-from palpate_bus.settings import Settings
-from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_bus.settings import BusConfigError, Settings
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.arm import TOOL, arm_of, base_pose
 from palpate_models.robot.kinematics import tool_pose
