@@ -22,9 +22,7 @@ TRUTH: Final[Rgba] = (190, 60, 255, 255)
 FINDING: Final[Rgba] = (20, 20, 20, 255)
 
 _RATIOS: Final = np.array([0.4, 0.7, 1.0, 1.6, 2.5, 5.0])
-_RAMP: Final = np.array(
-    [(40, 70, 160), (120, 170, 215), (242, 236, 216), (250, 180, 80), (225, 85, 50), (130, 10, 35)], dtype=float
-)
+_RAMP: Final = np.array([(40, 70, 160), (120, 170, 215), (242, 236, 216), (250, 180, 80), (225, 85, 50), (130, 10, 35)], float)
 
 LEGEND: Final = (0.5, 1.0, 2.0, 4.0)
 """Ratios shown in the legend."""

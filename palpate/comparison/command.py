@@ -9,9 +9,7 @@ from palpate.console import SteadyConsole, number, output_folder, print_json, sa
 
 
 def compare(
-    a: Annotated[
-        Path, typer.Argument(metavar="A", help="Results folder of assess or run, or a recording; or a table of outcomes.")
-    ],
+    a: Annotated[Path, typer.Argument(metavar="A", help="Results folder of assess or run, a recording, or a table of outcomes.")],
     b: Annotated[Path | None, typer.Argument(metavar="B", help="The other palpation of the same body.")] = None,
     mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Mapping of recordings.")] = None,
     out: Annotated[Path, output_folder("Folder of compare.json and compare.png.", "--out", "-o")] = Path("compare"),

@@ -145,9 +145,7 @@ def _options(data: bytes) -> BusOptions:
 
 
 def _round_trips() -> Iterator[FuzzTarget]:
-    yield _round_trip(
-        "attachment", unpack, _pack, WireError, [_pack((2**40 + number, 2**61, bytes(range(16)))) for number in range(3)]
-    )
+    yield _round_trip("attachment", unpack, _pack, WireError, [_pack((2**40 + n, 2**61, bytes(range(16)))) for n in range(3)])
     keys = [topic_key(topic, 3).encode() for topic in contract().topics.values()]
     yield _round_trip("key", lambda data: parse_key(_text(data)), lambda key: _bytes(str(key)), WireError, keys)
     node = "@ros2_lv/0/a1b2/0/0/NN/%/%/robot"

@@ -219,8 +219,6 @@ def _result(found: RunRecord) -> str:
     if seconds:
         rate = 3600 * sum(session.cases for session in found.sessions) / seconds
         core_s = found.core_s / found.cases
-        lines.append(
-            f"{rate:.0f} cases per hour, {core_s:.0f} s of a core per case, peak memory {found.peak_memory_bytes / 1e9:.1f} GB"
-        )
+        lines.append(f"{rate:.0f} cases per hour, {core_s:.0f} s of a core per case, peak {found.peak_memory_bytes / 1e9:.1f} GB")
         lines.append(f"10,000 such cases on 1,000 such cores would take {10 * core_s / 60:.1f} min")
     return "\n".join(lines)

@@ -311,9 +311,7 @@ def digest(outcomes: Iterable[Outcome]) -> str:
 def record(study: str, outcomes: Sequence[Outcome], sessions: Sequence[Session]) -> RunRecord:
     """Return the record of a finished study."""
     wallclock = any(outcome.case.runtime == "wallclock" for outcome in outcomes)
-    platforms = {
-        json.dumps(outcome.report.platform, sort_keys=True): outcome.report.platform for outcome in outcomes if outcome.report
-    }
+    platforms = {json.dumps(one.report.platform, sort_keys=True): one.report.platform for one in outcomes if one.report}
     return RunRecord(
         study=study,
         split=outcomes[0].case.split,

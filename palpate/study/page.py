@@ -274,11 +274,9 @@ def render(summary: Mapping[str, Any], methods: Sequence[MethodRow]) -> str:
 def figure(estimate: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> Markup:
     """Return a figure with its interval and sample size."""
     if estimate is None or estimate["value"] is None:
-        reason = (
-            "" if estimate is None or estimate["interval"].startswith(("bootstrap", "Wilson")) else f": {estimate['interval']}"
-        )
+        how = "" if estimate is None or estimate["interval"].startswith(("bootstrap", "Wilson")) else f": {estimate['interval']}"
         n = "" if estimate is None else f" (n = {estimate['n']})"
-        return Markup("<span class=quiet>not known{}{}</span>").format(n, reason)
+        return Markup("<span class=quiet>not known{}{}</span>").format(n, how)
     value, low, high = (None if estimate[k] is None else f"{scale * estimate[k]:.{digits}f}" for k in ("value", "low", "high"))
     ends = "no interval" if low is None else f"{low} to {high}"
     template = Markup("<b>{}{}</b> <span class=quiet title='{}'>({}; n = {})</span>")

@@ -98,9 +98,7 @@ class ObservedService:
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not only the newest of the periodic ones."""
         self.stepper = Stepper(service, member.contract, refuse=member.note_refused)
-        self.feeds = [
-            _Feed(member, buffer.topic, lossless or not buffer.topic.periodic) for buffer in self.stepper.buffers.values()
-        ]
+        self.feeds = [_Feed(member, one.topic, lossless or not one.topic.periodic) for one in self.stepper.buffers.values()]
         self.publishers = {name: member.publisher(port.topic) for name, port in self.stepper.ports.items()}
         self.now = NEVER
         """Newest simulated time [ns] received."""

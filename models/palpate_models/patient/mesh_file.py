@@ -89,9 +89,7 @@ def _check_ply_header(header: bytes, body: bytes) -> None:
     if not (header.startswith(b"ply") and len(counts) == len(re.findall(rb"^element\b", header, re.MULTILINE))):
         raise MeshError("its header, from `ply` to `end_header`, is not whole")
     _check_counts(*counts)
-    if missing := [
-        axis.decode() for axis in (b"x", b"y", b"z") if not re.search(rb"^property\s+\w+\s+%b\s*$" % axis, header, re.M)
-    ]:
+    if missing := [axis for axis in "xyz" if not re.search(rb"^property\s+\w+\s+%b\s*$" % axis.encode(), header, re.M)]:
         raise MeshError(f"its vertices have no property {', '.join(missing)}")
     if not re.search(rb"^property\s+list\s+\w+\s+\w+\s+vertex_ind(ex|ices)\s*$", header, re.MULTILINE):
         raise MeshError("its faces have no list vertex_indices: triangles are read, not strips or points")

@@ -76,9 +76,7 @@ def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str])
     """Return the source of a field's value: the last setting that wrote it, else file and line."""
     written = [setting.partition("=")[0].split(".") for setting in reversed(settings)]
     to_it = [words for words in written if words == list(field[: len(words)])]
-    within = [
-        words for words in written if field and words[: len(field)] == list(field)
-    ]  # of a section that is invalid as a whole
+    within = [one for one in written if field and one[: len(field)] == list(field)]  # of a section that is invalid as a whole
     for words in (*to_it, *within):
         return f"--set {'.'.join(words)}"
     line = _line(yaml.compose(text, yaml.SafeLoader), field)

@@ -132,6 +132,4 @@ def create(scenario: Scenario) -> RecorderService:
     settings = Settings.read()
     out = settings.require("out", f"the recorder writes to $PALPATE_OUT/{RECORDING}, so give it the run's folder")
     size = settings.record_file_mb
-    return RecorderService(
-        out / RECORDING, SIZES.file_bytes if size is None else size * 1_000_000, full=settings.record == "full"
-    )
+    return RecorderService(out / RECORDING, SIZES.file_bytes if size is None else size * 10**6, full=settings.record == "full")

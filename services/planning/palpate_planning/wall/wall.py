@@ -276,9 +276,7 @@ class Wall:
         share, previous = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
         touch = onset.touch_again(share * seen)
         moved = share * self.breath.seen_uncertainty
-        self.correction.revise(
-            HeightMeasurement(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND)
-        )
+        self.correction.revise(HeightMeasurement(foot.xy_A, before - touch.depth, touch.sigma, moved, onset.times[-1] / SECOND))
         return self.correction.height(foot.xy_A) - previous
 
 
