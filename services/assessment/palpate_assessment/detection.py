@@ -1,4 +1,4 @@
-"""Signs that distinguish a tensed muscle from a lump: stiff surroundings, and relaxation under contact.
+"""Detection of lumps: the shapes that join the model, and the evidence of what each is: lump, ridge, bone, tensed muscle.
 
 A muscle is tensed over a hand's breadth, so that a candidate on it lies on a rise of the smooth fields. Voluntary guarding fades
 during a slow slide, so that the same place becomes softer during a stroke: with w(x) a muscle's shape around the candidate and t
@@ -6,19 +6,17 @@ the time since contact, the strength of f = w(x) exp(-t / relaxation_s) with a p
 f' S^-1 y / (f' S^-1 f + fade_sd^-2).
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, minimize
-from scipy.spatial import cKDTree
 
 from palpate_assessment.model import KINDS_OF_ERROR, PRIOR, Regression, cholesky_inverse, fit_log_amplitudes, prior_log_amplitudes
 from palpate_assessment.observations import USABLE, Observations
-from palpate_assessment.shapes import Bump, ridge
+from palpate_assessment.shape_search import SEARCH, find_disc, find_ridge, find_rival, match_bumps
+from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, LENGTHS
 from palpate_models.numerics.frames import Array
 
@@ -37,15 +35,9 @@ class Muscle(NamedTuple):
     """Part of the samples that is taken for the relaxed wall."""
 
 
-class ShapeSearch(NamedTuple):
-    """Search for lumps."""
+class DetectionTuning(NamedTuple):
+    """Which shapes join the model, and what is believed of them."""
 
-    tries: int = 120
-    """Evaluations for place, radius and edge of the strongest bump that was tried."""
-    starts: int = 3
-    """Bumps apart from each other that are refined where no anatomy is assumed: a small lump may be between those tried first."""
-    widest: float = 1.3
-    """Maximum radius over the largest one of the bumps that are tried first."""
     max_lumps: int = 4
     """Maximum number of lumps where there is probably no bone."""
     max_with_bone: int = 7
@@ -53,33 +45,10 @@ class ShapeSearch(NamedTuple):
     """Prior of bone from which a place counts as bone."""
     weakest_t: float = 3.0
     """Minimum t with which a lump is weighed."""
-    too_near: float = 0.7
-    """Two lumps are at least this part of the sum of their radii apart."""
     alike: float = 1.5
     """Limit of t over t without the most influential stroke; two equal strokes: the root of 2."""
-    angles: int = 8
-    """Directions of the ridges that are tried."""
-    half_lengths: tuple[float, ...] = (0.75, 1.5)
-    """Half of their lengths, over the radius of the largest bump."""
-    narrowest: float = 0.5
-    """Minimum radius or half width where no anatomy is assumed, over that of the smallest bump."""
-    turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
-    """Angles [rad] by which a ridge may turn from one piece to the next."""
-    gain: float = 1.6
-    """Gain of the log evidence from which a ridge becomes longer by a piece: the logarithm of the number of turns."""
-    usual: int = 2
-    """Index of the usual radius, which is the length of a piece."""
     min_gain: float = 0.0
     """Log Bayes factor, over all places, below which no more lumps are sought where no anatomy is assumed."""
-    surrounded: float = 0.5
-    """Minimum share of a structure's outline that is within the samples where no anatomy is assumed: it may be at the border."""
-    narrow: float = 0.354
-    """Maximum radius, over the lesser width of the samples, where no anatomy is assumed: within a circle of that width, a disc of
-    1/sqrt(8) of it has as much area as its surroundings."""
-    rival_offsets_m: tuple[float, ...] = (-0.012, 0.0, 0.012)
-    """Distances of the middles of ridges from the disc that they may be instead, along each axis."""
-    rival_tries: int = 80
-    """Evaluations for the strongest of them."""
     border_m: float = 0.02
     """Distance from the border over which bone becomes improbable."""
     midline_m: float = 0.009
@@ -90,7 +59,7 @@ class ShapeSearch(NamedTuple):
     """A stroke crosses a lump whose shape is at least this part of the highest value of any sample: its centre may be outside."""
 
 
-MUSCLE, SEARCH = Muscle(), ShapeSearch()
+MUSCLE, DETECTION = Muscle(), DetectionTuning()
 
 
 class Signs(NamedTuple):
@@ -106,9 +75,8 @@ def signs(regression: Regression, lump: Bump) -> Signs:
     """Return the signs of a muscle around a lump of a regression."""
     o = regression.observations
     smooth = regression.smooth(np.vstack(((lump.x, lump.y), o.xy)))
-    fading = regression.whiten(
-        Bump(lump.x, lump.y, MUSCLE.radius_m, MUSCLE.edge_m)(o.xy) * np.exp(-o.touched_for / MUSCLE.relaxation_s)
-    )
+    muscle = Bump(lump.x, lump.y, MUSCLE.radius_m, MUSCLE.edge_m)
+    fading = regression.whiten(muscle(o.xy) * np.exp(-o.touched_for / MUSCLE.relaxation_s))
     fade = regression.whitened @ fading / (fading @ fading + MUSCLE.fade_sd**-2)
     return Signs(rise=float(smooth[0] - np.quantile(smooth[1:], MUSCLE.softest)), fade=float(fade))
 
@@ -164,9 +132,9 @@ class Candidate(NamedTuple):
         `marked`: overlap with skin that the user has marked as scarred (`marked_share`).
         """
         at = np.array([[self.disc.x, self.disc.y]])
-        midline = float(np.exp(-0.5 * (self.disc.x / SEARCH.midline_m) ** 2))
+        midline = float(np.exp(-0.5 * (self.disc.x / DETECTION.midline_m) ** 2))
         slim = float(np.log1p(self.ridge.length / (2 * self.ridge.radius))) if self.ridge else 0.0
-        inside = float(np.clip(self.inside_m / SEARCH.border_m, -1.0, 3.0))
+        inside = float(np.clip(self.inside_m / DETECTION.border_m, -1.0, 3.0))
         bone = (inside, float(ABDOMEN.bone(at)[0]), self.steeper, abs(self.log_contrast))
         return np.array((self.ridge_gain, slim, marked, *bone, midline, self.ridge_gain, slim))
 
@@ -177,30 +145,23 @@ class Candidate(NamedTuple):
         return float(np.clip((contrast - np.log(FELT)) * abs(self.t) / max(contrast, 1e-9), -SURE, SURE))
 
 
-def match_bumps(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:
-    """Log-contrast e and strength t of bumps under a regression that does not have them, shape (k,) each."""
-    seen = regression.whiten(np.array([bump(regression.observations.xy) for bump in bumps]).T)
-    power = np.maximum((seen**2).sum(axis=0), 1e-9)
-    return regression.whitened @ seen / power, regression.whitened @ seen / np.sqrt(power)
-
-
 def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
     """Return the regression with the detected lumps, and these lumps, each evaluated with the others in the model."""
     steps = [Regression(o, (), fit_log_amplitudes(o, ()))]
     shapes: list[tuple[Bump, Bump | None]] = []
-    while len(steps) <= SEARCH.max_with_bone and _open_wall(steps[-1]) < SEARCH.max_lumps:
+    while len(steps) <= DETECTION.max_with_bone and _open_wall(steps[-1]) < DETECTION.max_lumps:
         last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmask(steps[-1]))
         found = [find_disc(last), *([] if o.standard.anatomy else [find_ridge(last)])]
-        bumps = [bump for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
+        bumps = [bump for bump, strength in found if bump is not None and strength >= DETECTION.weakest_t]
         if o.standard.anatomy and bumps:
-            shapes.append((bumps[0], ridge_instead(last, bumps[0])))
+            shapes.append((bumps[0], find_rival(last, bumps[0])))
             bumps = [prefer(last, *shapes[-1])]
         lumps = [(*last.lumps, bump) for bump in bumps]
         more = [Regression(o, some, fit_log_amplitudes(o, some, last.log_amplitudes)) for some in lumps]
         if not more:
             break
         best = more[0] if o.standard.anatomy else max(more, key=partial(measure_gain, steps[-1]))
-        if o.standard.anatomy is None and measure_gain(steps[-1], best) < SEARCH.min_gain:
+        if o.standard.anatomy is None and measure_gain(steps[-1], best) < DETECTION.min_gain:
             break
         steps.append(best)
     both = shapes or [(lump, None) for lump in steps[-1].lumps]
@@ -213,7 +174,7 @@ def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
 def _open_wall(regression: Regression) -> int:
     """Return the number of lumps where there is probably no bone."""
     anatomy, centres = regression.observations.standard.anatomy, np.array([(b.x, b.y) for b in regression.lumps]).reshape(-1, 2)
-    return len(centres) if anatomy is None else int((anatomy.bone(centres) < SEARCH.bone).sum())
+    return len(centres) if anatomy is None else int((anatomy.bone(centres) < DETECTION.bone).sum())
 
 
 def unmask(regression: Regression) -> Array:
@@ -234,7 +195,7 @@ def weigh(regression: Regression, lump: Bump, disc: Bump, instead: Bump | None) 
     if o.standard.anatomy is None:
         return candidate
     felt = o.exponent > 0
-    steep = o.exponent[felt & (disc.distance(o.xy) < disc.radius + SEARCH.border_m)]
+    steep = o.exponent[felt & (disc.distance(o.xy) < disc.radius + DETECTION.border_m)]
     return candidate._replace(
         ridge=instead,
         ridge_gain=ridge_gain(without, disc, instead),
@@ -253,14 +214,7 @@ def ridge_gain(regression: Regression, disc: Bump, instead: Bump | None) -> floa
 
 def prefer(regression: Regression, disc: Bump, instead: Bump | None) -> Bump:
     """Return the shape that joins the model."""
-    return instead if instead and ridge_gain(regression, disc, instead) > SEARCH.preferred else disc
-
-
-def ridge_instead(regression: Regression, disc: Bump) -> Bump | None:
-    """Return the strongest ridge that may be there instead of a disc, under a regression without it."""
-    (stiffer,) = np.sign(match_bumps(regression, [disc])[0])
-    centres = np.array([(disc.x + x, disc.y + y) for x in SEARCH.rival_offsets_m for y in SEARCH.rival_offsets_m])
-    return _best_ridge(regression, centres, SEARCH.rival_tries, stiffer)[0]
+    return instead if instead and ridge_gain(regression, disc, instead) > DETECTION.preferred else disc
 
 
 def measure_gain(before: Regression, after: Regression) -> float:
@@ -295,7 +249,7 @@ def limit_strength(regression: Regression, lump: Bump, t: float) -> float:
     y = o.y - regression.level
     pulls = precision @ np.column_stack((height, y))
     left = np.inf
-    for stroke in np.unique(o.stroke[height > SEARCH.crossed * height.max()]):
+    for stroke in np.unique(o.stroke[height > DETECTION.crossed * height.max()]):
         own = np.flatnonzero(o.stroke == stroke)
         if len(o.y) - len(own) < USABLE.min_samples:
             continue
@@ -304,119 +258,4 @@ def limit_strength(regression: Regression, lump: Bump, t: float) -> float:
         match = height @ pulls[:, 1] - pulls[own, 0] @ lost[:, 1]
         left = min(left, float(np.sign(t) * match / np.sqrt(max(power, 1e-9))))
     left = left if np.isfinite(left) else 0.0
-    return float(np.sign(t)) * min(abs(t), SEARCH.alike * max(left, 0.0))
-
-
-def find_disc(regression: Regression) -> tuple[Bump | None, float]:
-    """Return the disc that stands out most from what the regression explains, and how much (|t|)."""
-    lengths = regression.observations.standard.lengths
-    bumps = [Bump(x, y, radius, lengths.edge_m) for x, y in _centres(regression).tolist() for radius in lengths.radii_m]
-    return _best(regression, bumps, lambda p: Bump(p[0], p[1], *np.exp(p[2:])))
-
-
-def find_ridge(regression: Regression) -> tuple[Bump | None, float]:
-    """Return the ridge that stands out most from what the regression explains, and how much (t)."""
-    band, t = _best_ridge(regression, _centres(regression))
-    return (band, t) if band is None else _grow(regression, band, t)
-
-
-def _best_ridge(
-    regression: Regression, centres: Array, tries: int = SEARCH.tries, sign: float = 0.0
-) -> tuple[Bump | None, float]:
-    """Return the strongest ridge about centres [m], shape (k, 2), as `_best` does."""
-    lengths = regression.observations.standard.lengths
-    angles = np.linspace(0.0, np.pi, SEARCH.angles, endpoint=False)
-    halves = np.array([h * lengths.radii_m[-1] * np.array((np.cos(a), np.sin(a))) for a in angles for h in SEARCH.half_lengths])
-    ridges = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
-    return _best(regression, ridges, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])), tries, sign)
-
-
-def _centres(regression: Regression) -> Array:
-    """Return centres of the bumps that are tried [m], shape (k, 2)."""
-    xy, pitch = regression.observations.xy, regression.observations.standard.lengths.pitch_m
-    x, y = (np.arange(a - pitch, b + pitch + 1e-9, pitch) for a, b in zip(xy.min(axis=0), xy.max(axis=0), strict=True))
-    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return centres[cKDTree(xy).query(centres)[0] <= pitch]
-
-
-def _best(
-    regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bump], tries: int = SEARCH.tries, sign: float = 0.0
-) -> tuple[Bump | None, float]:
-    """Return the strongest of some bumps after place, radius and edge were refined, and its strength.
-
-    `shape`: the bump of its parameters: points [m], and the logarithms of radius and edge. `sign`: of the contrast of ridges; 0:
-    those which are stiffer than their surroundings, as vessels, scars and tendons are.
-    """
-    bumps = [bump for bump in bumps if _is_possible(regression, bump)]
-    if not bumps:
-        return None, 0.0
-    xy, lengths = regression.observations.xy, regression.observations.standard.lengths
-    t = _strengths(regression, bumps, sign)
-
-    def loss(p: Array) -> float:
-        bump = shape(p)
-        return -float(_strengths(regression, [bump], sign)[0]) if _is_possible(regression, bump) else 0.0
-
-    anatomy = regression.observations.standard.anatomy is not None
-    narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy and not bumps[0].path else SEARCH.narrowest), lengths.edge_m))
-    widest = np.log((lengths.radii_m[-1] * SEARCH.widest, lengths.wide_edge_m))
-    low, high = xy.min(axis=0) - lengths.pitch_m, xy.max(axis=0) + lengths.pitch_m
-    firsts: list[Bump] = []
-    for k in np.argsort(-t, kind="stable"):
-        if all(bumps[k].apart(one) >= SEARCH.too_near for one in firsts):
-            firsts.append(bumps[k])
-        if len(firsts) >= (1 if anatomy else SEARCH.starts):
-            break
-    found = []
-    for first in firsts:
-        points = np.array(first.path or ((first.x, first.y),)).ravel()
-        limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
-        start: Array = np.clip((*points, np.log(first.radius), np.log(first.edge)), limits.lb, limits.ub)
-        simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
-        found.append(
-            minimize(
-                loss,
-                start,
-                method="Nelder-Mead",
-                bounds=limits,
-                options={"initial_simplex": simplex, "maxfev": tries, "xatol": 1e-4, "fatol": 1e-2},
-            )
-        )
-    best = min(found, key=lambda one: float(one.fun))
-    return shape(best.x), -float(best.fun)
-
-
-def _strengths(regression: Regression, bumps: Sequence[Bump], sign: float = 0.0) -> Array:
-    """Return |t| of discs, and t of ridges times the sign of their contrast, that of stiffer ones if 0; shape (k,)."""
-    _, t = match_bumps(regression, bumps)
-    return np.where([bool(bump.path) for bump in bumps], t * (sign or 1.0), np.abs(t))
-
-
-def _grow(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
-    """Return a ridge, longer at its ends by pieces in any forward direction while the evidence grows, and its |t|."""
-    step = regression.observations.standard.lengths.radii_m[SEARCH.usual]
-    turns = [np.array(((np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a)))) for a in SEARCH.turns]
-    grows = True
-    while grows:
-        grows = False
-        for forward in (1, -1):
-            corners = np.array(band.path)[::forward]
-            along = (corners[-1] - corners[-2]) / np.linalg.norm(corners[-1] - corners[-2])
-            longer = [ridge(np.vstack((corners, corners[-1] + step * turn @ along)), band.radius, band.edge) for turn in turns]
-            longer = [one for one in longer if _is_possible(regression, one)]
-            found = _strengths(regression, longer) if longer else np.zeros(1)
-            if 0.5 * found.max() ** 2 > 0.5 * t**2 + SEARCH.gain:
-                band, t, grows = longer[int(np.argmax(found))], float(found.max()), True
-    return band, t
-
-
-def _is_possible(regression: Regression, bump: Bump) -> bool:
-    """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
-    o = regression.observations
-    if (places := o.standard.places) is not None and not (
-        places.encloses(np.array(bump.path or ((bump.x, bump.y),))).all()
-        and bump.radius <= SEARCH.narrow * o.width
-        and places.encloses(bump.outline()).mean() >= SEARCH.surrounded
-    ):
-        return False
-    return all(bump.apart(one) >= SEARCH.too_near for one in regression.lumps)
+    return float(np.sign(t)) * min(abs(t), DETECTION.alike * max(left, 0.0))

@@ -5,11 +5,12 @@ import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.assess import AssessedMap, assess, find_contradicted
-from palpate_assessment.detection import find_disc, limit_strength, match_bumps
+from palpate_assessment.detection import limit_strength
 from palpate_assessment.grid import map_grid
 from palpate_assessment.model import Regression, fit_log_amplitudes, prior_log_amplitudes
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.shape_search import find_disc, match_bumps
 from palpate_assessment.shapes import Bump, ridge
 from palpate_assessment.standard import LENGTHS, USUAL, PressStandard
 
