@@ -41,6 +41,7 @@ NEEDS = {
     "research.search.whole": "study",
     "palpate.study": "study",
     "palpate_bus": BARE,
+    "palpate_bus.mcap_records": "recordings group",
     "palpate_bus.recordings": "recordings group",
     "palpate_bus.security.keys": "conductor group",
     "palpate_errors": BARE,

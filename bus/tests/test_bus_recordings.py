@@ -10,8 +10,9 @@ import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
 from palpate_bus.contract import contract
+from palpate_bus.mcap_records import RecordingError
 from palpate_bus.messages.typestore import definition, type_hash
-from palpate_bus.recordings import RecordingError, open_recording
+from palpate_bus.recordings import open_recording
 from palpate_errors import UserError
 
 IMAGE, TOPIC = "sensor_msgs/msg/Image", "camera/depth/image_raw"

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from palpate_bus.recordings import RecordingError, open_recording
+from palpate_bus.mcap_records import RecordingError
+from palpate_bus.recordings import open_recording
 from palpate_errors import UserError
 from palpate_fmu.reading import FmuError, read_description
 from palpate_inputs import Bounds, InputError, InputFile, bounds, brief, parse_json, parse_yaml, printable, read_arrays

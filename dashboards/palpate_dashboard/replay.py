@@ -18,9 +18,10 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message as McapMessage, Schema
 
 from palpate_bus.contract import Topic, contract
+from palpate_bus.mcap_records import BROKEN, RecordingError, complete_records
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.stamps import NS
-from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
+from palpate_bus.recordings import recorded_type
 from palpate_bus.runs.announcement import Run, live_runs
 from palpate_bus.runs.operator import OperatorKeys, order
 from palpate_bus.runtime.lockstep import Packet, Stepper

@@ -17,8 +17,9 @@ from typing import Any
 
 from mcap.records import Channel as ChannelRecord, Message, Schema
 
+from palpate_bus.mcap_records import Gap, complete_records
 from palpate_bus.messages.stamps import NS
-from palpate_bus.recordings import Gap, RecordedMessage, RecordedType, Recording, complete_records, kept_every_ms, recorded_type
+from palpate_bus.recordings import RecordedMessage, RecordedType, Recording, kept_every_ms, recorded_type
 from palpate_inputs import InputError, parse_yaml
 from palpate_recorder.bag import BagWriter, Channel
 

@@ -17,10 +17,11 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 
 from palpate_bus.contract import contract
+from palpate_bus.mcap_records import Gap, RecordingError, complete_records
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import header
-from palpate_bus.recordings import Gap, RecordingError, complete_records, open_recording
+from palpate_bus.recordings import open_recording
 from palpate_bus.settings import RECORDING
 from palpate_models.scenario.schema import Scenario
 from palpate_recorder.bag import Channel
