@@ -34,9 +34,7 @@ def run_section(name: str) -> PageSection:
 @app.callback()
 def validate(
     out: Annotated[Path, output_folder("Folder for validate.json and the plots.", "--out", "-o")] = Path("out/validation"),
-    only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
-    ] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}.")] = None,
 ) -> None:
     """Measure the physics against Hertz, measured people, DART and theory. The exit status is 3 if a bound is missed."""
     from palpate_validation.check import failures, table, write

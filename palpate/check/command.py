@@ -17,9 +17,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     start: Annotated[str | None, typer.Option(metavar="COMMAND", help="Start the implementation with this command.")] = None,
     service: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME_OR_FILE", help="Check an installed implementation or a Python file in this process, in simulated time."
-        ),
+        typer.Option(metavar="NAME_OR_FILE", help="Check an implementation or a Python file in this process, in simulated time."),
     ] = None,
     scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds their breath.")] = "clean",
     given: Settings = None,

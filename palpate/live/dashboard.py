@@ -32,9 +32,7 @@ def dashboard(
     port: Annotated[int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next.")] = 9876,
     native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
     chosen: ChosenRun = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Write a picture of a recorded run at the time --at; needs Chromium.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a recorded run at --at; needs Chromium.")] = None,
     at: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="With --picture: the simulated time.")] = 60.0,
     film_file: Annotated[Path | None, typer.Option("--film", metavar="GIF", help="Film a recorded run; needs Chromium.")] = None,
 ) -> None:

@@ -10,9 +10,7 @@ from palpate_errors import ExitStatus
 
 
 def assess(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="CSV, Parquet, MCAP, a rosbag2 folder, or the results folder of a run.")
-    ],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="CSV, Parquet, MCAP, rosbag2 or results folder.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results; with --inspect the file of the mapping.")],
     mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="YAML: columns or topics, units, frames, tool.")] = None,
     inspect: Annotated[bool, typer.Option("--inspect", help="Propose a mapping, with a picture next to it.")] = False,

@@ -56,9 +56,7 @@ def write_page(folder: Path) -> Path:
     """Write report.html into the results folder of a run; return its path. Raises EvidenceError."""
     report, evidence = read_report(folder), read_evidence(folder)
     if report.run != evidence.run:
-        raise EvidenceError(
-            f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of the run {evidence.run}; expected files of one run"
-        )
+        raise EvidenceError(f"{folder}: report.json is of run {report.run}, {EVIDENCE} of run {evidence.run}; expected one run")
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
     except ScenarioError as error:

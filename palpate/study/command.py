@@ -53,9 +53,7 @@ def list_studies() -> None:
 @app.command()
 def run(  # noqa: PLR0913 - the options of a command
     name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A study (see `palpate study list`) or a YAML file.")],
-    split: Annotated[
-        str, typer.Option(help="tune: patients to choose thresholds on; test: those to report; shift: of other kinds.")
-    ] = "test",
+    split: Annotated[str, typer.Option(help="tune: to choose thresholds; test: to report; shift: other patients.")] = "test",
     number: Annotated[int | None, typer.Option(min=1, help="Patients of each population, instead of the study's own.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Cases at a time on this machine; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")] = None,
@@ -124,9 +122,7 @@ def merge_parts(
 
 
 @app.command("scenario")
-def scenario_of_case(
-    case: Annotated[Path, typer.Argument(metavar="FILE", help="A case, such as out/study/release-test/cases/ID.json.")],
-) -> None:
+def scenario_of_case(case: Annotated[Path, typer.Argument(metavar="FILE", help="A file cases/ID.json of a study.")]) -> None:
     """Print the scenario of a case, to examine its patient again with everything a run shows.
 
     [bold]Examples[/]

@@ -302,9 +302,7 @@ def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
 
 def digest(outcomes: Iterable[Outcome]) -> str:
     """Return the SHA-256 over the sorted pairs of case and run hash; a case without a hash counts by its reason."""
-    pairs = sorted(
-        (outcome.case.case_id, (outcome.report and outcome.report.run_hash) or f"without: {outcome.why}") for outcome in outcomes
-    )
+    pairs = sorted((one.case.case_id, (one.report and one.report.run_hash) or f"without: {one.why}") for one in outcomes)
     return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
 
 

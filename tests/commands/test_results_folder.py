@@ -133,7 +133,7 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
         assert run in (one / name).read_text(encoding="utf-8"), name
     assert run in Image.open(one / "map.png").info["Comment"]
     shutil.copy(one / "evidence.mcap", two)
-    with pytest.raises(EvidenceError, match="expected files of one run"):
+    with pytest.raises(EvidenceError, match="expected one run"):
         write_page(two)
 
 

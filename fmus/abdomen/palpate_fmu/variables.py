@@ -146,9 +146,8 @@ TABLE: tuple[Variable, ...] = (
     Variable(26, "contacts", "outputs.contacts", "Vertices in contact", group="STATE", integer=True, low=0),
     Variable(27, "breathing_excursion", "outputs.excursion", "Outward, where the profile is 1", "m", group="STATE"),
     Variable(28, "elastic_energy", "outputs.energy", "Stored in springs, Maxwell branches and skin", "J", group="ENERGY", low=0),
-    _parameter(
-        30, "indenter_radius", "m", (0.001, 0.1), "Radius of the sphere", "radius", start=0.015, kind=VariableKind.TUNABLE
-    ),
+    _parameter(30, "indenter_radius", "m", (0.001, 0.1), "Radius of the sphere", "radius", start=0.015,
+        kind=VariableKind.TUNABLE),
     _parameter(31, "stiffness_scale", "1", (0.01, 100), "Factor on the foundation modulus everywhere", start=1.0, member="scale"),
     _parameter(32, "pasternak_length", "m", (0.002, 0.1), "l = sqrt(G / k_w)", member="length"),
     _parameter(33, "dashpot", "s", (1e-4, 1), "Dashpot over foundation modulus"),
@@ -157,34 +156,24 @@ TABLE: tuple[Variable, ...] = (
     _parameter(36, "voluntary", None, (0, 1), "Whether guarding fades under gentle pressure (1)", integer=True),
     _parameter(37, "breathing_offset", "s", (-1e6, 1e6), "How far the breaths are ahead of time", start=0.0),
     _parameter(38, "lesion_count", None, (0, LESIONS), "How many entries of the lesion list count", integer=True),
-    _parameter(
-        39, "contact_time", "s", (1e-5, 0.1), "Model exchange: within which contact and friction are restored", start=1e-3
-    ),
+    _parameter(39, "contact_time", "s", (1e-5, 0.1), "Model exchange: within which contact and friction are restored",
+        start=1e-3),
     _parameter(40, "prony_g", "1", (0, 1), "Relaxing fractions of the stiffness, sum below 1", shape=(BRANCHES,)),
     _parameter(44, "prony_tau", "s", (1e-4, 1e6), "Their time constants", shape=(BRANCHES,)),
     _parameter(48, "lesion_centre", "m", (-10, 10), "Centre in the xy plane", shape=(LESIONS, 2)),
     _parameter(64, "lesion_radii", "m", (1e-4, 10), "Half axes of the half-contrast outline", shape=(LESIONS, 2)),
     _parameter(80, "lesion_contrast", "1", (0.001, 20), "Stiffness at the centre over that without", shape=(LESIONS,)),
     _parameter(88, "lesion_edge", "m", (1e-4, 10), "Width of the smooth edge", shape=(LESIONS,)),
-    Variable(
-        1000, "sample_displacement", "arrays.sample_inward", "Inward displacement of sample vertices", "m", ("samples",),
-        group="INWARD", versions=(2,),
-    ),
-    Variable(
-        1500, "sample_position", "arrays.sample_position", "Rest position of sample vertices", "m", ("samples", 3),
-        role=VariableRole.CALCULATED, versions=(2,),
-    ),
-    _array(
-        5000, "surface_displacement", "Inward displacement of every vertex", "m", member="inward",
-        role=VariableRole.OUTPUT, group="INWARD",
-    ),
-    _array(
-        5001, "deformed_position", "Vertices of the deformed surface", "m", ("vertices", 3), "position",
-        role=VariableRole.LOCAL, group="SHAPE",
-    ),
-    _array(
-        5002, "deformed_normal", "Its outward normals", "1", ("vertices", 3), "normal", role=VariableRole.LOCAL, group="SHAPE",
-    ),
+    Variable(1000, "sample_displacement", "arrays.sample_inward", "Inward displacement of sample vertices", "m", ("samples",),
+        group="INWARD", versions=(2,)),
+    Variable(1500, "sample_position", "arrays.sample_position", "Rest position of sample vertices", "m", ("samples", 3),
+        role=VariableRole.CALCULATED, versions=(2,)),
+    _array(5000, "surface_displacement", "Inward displacement of every vertex", "m", member="inward",
+        role=VariableRole.OUTPUT, group="INWARD"),
+    _array(5001, "deformed_position", "Vertices of the deformed surface", "m", ("vertices", 3), "position",
+        role=VariableRole.LOCAL, group="SHAPE"),
+    _array(5002, "deformed_normal", "Its outward normals", "1", ("vertices", 3), "normal", role=VariableRole.LOCAL,
+        group="SHAPE"),
     _array(5003, "rest_position", "Vertices at rest", "m", ("vertices", 3)),
     _array(5004, "rest_normal", "Outward normals at rest", "1", ("vertices", 3)),
     _array(5005, "stiffness", "k_w with lesions", "N/m3", group="MATRICES"),
@@ -192,22 +181,14 @@ TABLE: tuple[Variable, ...] = (
     _array(5007, "lesion", "Lesion in which a vertex lies, from 0; -1: none", None, group="MATRICES", integer=True),
     _array(5009, "stiffening", "How fast the modulus rises with depth", "1/m"),
     _array(5010, "tension", "What contracted muscle adds to the modulus, over k_w", "1"),
-    _array(
-        5008, "triangles", "Vertex indices from 0, counter-clockwise seen from outside", None, ("triangles", 3), integer=True
-    ),
-    *_state(
-        100_000_000, 200_000_000, "displacement", "displacement",
-        "Inward displacement of every vertex, breathing excluded", ("vertices",),
-    ),
-    *_state(
-        300_000_000, 400_000_000, "relaxation", "relaxation",
-        "What of it each Prony branch has relaxed", ("branches", "vertices"),
-    ),
+    _array(5008, "triangles", "Vertex indices from 0, counter-clockwise seen from outside", None, ("triangles", 3), integer=True),
+    *_state(100_000_000, 200_000_000, "displacement", "displacement",
+        "Inward displacement of every vertex, breathing excluded", ("vertices",)),
+    *_state(300_000_000, 400_000_000, "relaxation", "relaxation",
+        "What of it each Prony branch has relaxed", ("branches", "vertices")),
     *_state(3000, 3003, "skin_stretch", "stretch", "Stretch of the skin by friction", (3,)),
-    *_state(
-        3006, 3007, "activation", "activation", "How far guarding muscle is contracted: 1 is all of its tension", (),
-        "1", nominal=1.0, start=1.0,
-    ),
+    *_state(3006, 3007, "activation", "activation", "How far guarding muscle is contracted: 1 is all of its tension", (),
+        "1", nominal=1.0, start=1.0),
 )  # fmt: skip
 
 

@@ -195,9 +195,7 @@ def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Sc
     if not isinstance(source, Scenario):
         return load_scenario(str(source), seed=seed)
     if seed not in (None, source.seed):
-        raise ScenarioError(
-            f"{source.name}: seed = {seed}: this scenario was drawn from seed {source.seed}; give the seed with its name or file"
-        )
+        raise ScenarioError(f"{source.name}: seed = {seed}: drawn from seed {source.seed}; give the seed with its name or file")
     return source
 
 
