@@ -24,14 +24,8 @@ DOMAIN_MAX = 232
 """Highest ROS domain in DDS's default port range; zenoh has no limit."""
 
 COMPOSE_VARIABLES = {
-    "PALPATE_SCENARIO_NAME": (
-        "lump",
-        "Scenario of the containers: a name, or a file in the results folder such as `/results/my.yaml`.",
-    ),
-    "PALPATE_SETTINGS": (
-        "",
-        "Changes to the scenario, `a.b=c`, separated by spaces; no spaces inside: `exam.region_m=[0.1,0.1]`.",
-    ),
+    "PALPATE_SCENARIO_NAME": ("lump", "Scenario of the containers: a name, or a file in the results folder, `/results/my.yaml`."),
+    "PALPATE_SETTINGS": ("", "Changes to the scenario, `a.b=c`, separated by spaces; none inside: `exam.region_m=[0.1,0.1]`."),
     "PALPATE_RESULTS": ("./out", "Folder of this machine to which the containers write."),
     "PALPATE_UID": ("1000", "User id of the containers' files; on Linux `$(id -u)`."),
     "PALPATE_GID": ("1000", "Group id of the containers' files; on Linux `$(id -g)`."),

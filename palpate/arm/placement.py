@@ -96,16 +96,10 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
     first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), POSTURES.pressing_force_n)[0]
     residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
     corner = base[0] + BASE_SIDE_M / 2 * (ca.cos(base[3]) + ca.sqrt(ca.sin(base[3]) ** 2 + 1e-6))
-    problem = {
-        "x": ca.vertcat(base, ca.vec(Q), worst),
-        "f": objective,
-        "g": ca.vertcat(ca.vec(residual), corner, costs.T - worst),
-    }
-    options = {
-        "ipopt": {"max_iter": PLACEMENT.ipopt_steps, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
-        "print_time": False,
-    }
-    solver = ca.nlpsol("placement", "ipopt", problem, options)
+    limited = ca.vertcat(ca.vec(residual), corner, costs.T - worst)
+    problem = {"x": ca.vertcat(base, ca.vec(Q), worst), "f": objective, "g": limited}
+    ipopt = {"max_iter": PLACEMENT.ipopt_steps, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6}
+    solver = ca.nlpsol("placement", "ipopt", problem, {"ipopt": ipopt, "print_time": False})
     lower, upper = np.tile(model.lower_rad + PLACEMENT.margin_rad, count), np.tile(model.upper_rad - PLACEMENT.margin_rad, count)
     zeros = np.zeros(5 * count)
     result = solver(

@@ -71,10 +71,8 @@ class ChildPlace:
     def wait_text(self) -> str:
         """Return a text for a child that stays at its present place."""
         role, t, stage = self.now()
-        doing = {
-            ChildStage.LOAD: "start; a first run compiles, which takes a minute or more",
-            ChildStage.FINISH: "finish its files",
-        }
+        start = "start; a first run compiles, which takes a minute or more"
+        doing = {ChildStage.LOAD: start, ChildStage.FINISH: "finish its files"}
         what = doing.get(stage, f"finish its step at {t / NS:.3f} s")
         return f"waiting for {role or 'the process of all services'} to {what} ({self.limit_s():g} s at most)"
 

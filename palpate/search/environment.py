@@ -67,10 +67,8 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._kind, self._presses, self._patients, self._maps = hand, presses, patients, maps
         self._begin(_cases(0))
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
-        parts: dict[str, spaces.Space[Any]] = {
-            "history": spaces.Box(-10.0, 10.0, (presses, 5), np.float32),
-            "left": spaces.Box(0.0, 1.0, (1,), np.float32),
-        }
+        history, left = spaces.Box(-10.0, 10.0, (presses, 5), np.float32), spaces.Box(0.0, 1.0, (1,), np.float32)
+        parts: dict[str, spaces.Space[Any]] = {"history": history, "left": left}
         if maps:
             parts["maps"] = spaces.Box(-20.0, 20.0, self.maps_shape, np.float32)
         self.observation_space: spaces.Space[Any] = spaces.Dict(parts)

@@ -74,11 +74,7 @@ class _Feed:
                     continue
                 message = self._decode(payload)
                 self._check(message, (sequence - 1) * self.topic.period)
-            except (
-                WireError,
-                AttributeError,
-                codec.CodecError,
-            ):  # every sender is accepted: invalid bytes must not end an observer
+            except (WireError, AttributeError, codec.CodecError):  # of any sender: invalid bytes must not end an observer
                 self.dropped["garbage"] += 1
                 continue
             except RefusedMessage as refused:

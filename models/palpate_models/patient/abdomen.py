@@ -156,10 +156,8 @@ def _strip(left: NDArray[np.intp], right: NDArray[np.intp]) -> NDArray[np.int32]
 
 def _plan(body: _Body, edge: float) -> tuple[Array, int]:
     """Points in (s, y), shape (n, 2), the border's last, and how many are within the border."""
-    half_s, half_y = (
-        body.arc(min(SHAPE.examined_half_m, 0.8 * float(body._x.max()))),
-        min(SHAPE.examined_half_m, 0.8 * body.half_length),
-    )
+    half_s = body.arc(min(SHAPE.examined_half_m, 0.8 * float(body._x.max())))
+    half_y = min(SHAPE.examined_half_m, 0.8 * body.half_length)
     outer = (body.half_arc, body.half_length)
     inside = np.concatenate((lattice(half_s, half_y, edge), rings(half_s, half_y, outer, edge)))
     end = _grade(outer[0], outer[1] - half_y, half_s, edge)

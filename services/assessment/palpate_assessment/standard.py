@@ -146,14 +146,8 @@ class PressStandard:
         """Return the standard of presses of another body: their own depth, force and exponent, and no anatomy."""
         depth_m = float(np.median([sample.depth for sample in samples]))
         force_n = float(np.median([sample.force for sample in samples]))
-        tissue = {
-            "exponent": exponent,
-            "exponent_sd": exponent_sd,
-            "conversion": 0.0,
-            "conversion_sd": 0.0,
-            "held": 0.0,
-            "lead_s": 0.0,
-        }
+        none = dict.fromkeys(("conversion", "conversion_sd", "held", "lead_s"), 0.0)
+        tissue = {"exponent": exponent, "exponent_sd": exponent_sd, **none}
         calibration = load_calibration().model_copy(update=tissue)
         return cls(radius_m, depth_m, force_n, None, places_of(samples), calibration, ONSET_REFERENCED_ERRORS)
 

@@ -251,11 +251,8 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     cost += POSTURES.smoothness * ca.dot(weights, ca.sum1(travel**2).T)
     residual = functions.task.map(count)(Q, bases, P, frames)[0]
     problem = {"x": ca.vec(Q), "p": ca.vertcat(base, ca.vec(P), ca.vec(frames), weights), "f": cost, "g": ca.vec(residual)}
-    options = {
-        "ipopt": {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
-        "print_time": False,
-    }
-    return ca.nlpsol("redundancy", "ipopt", problem, options)
+    ipopt = {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6}
+    return ca.nlpsol("redundancy", "ipopt", problem, {"ipopt": ipopt, "print_time": False})
 
 
 def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> Array | None:
