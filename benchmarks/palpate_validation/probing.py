@@ -18,9 +18,7 @@ OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 
 STILL = np.zeros(3)
 
 
-def hold(
-    tissue: WinklerTissue, depth: float, radius: float, xy: Sequence[float] = (0.0, 0.0), seconds: float = SETTLE_S
-) -> float:
+def hold(tissue: WinklerTissue, depth: float, radius: float, xy: Sequence[float] = (0, 0), seconds: float = SETTLE_S) -> float:
     """Return the normal force [N] on a sphere of `radius` [m] held at `depth` [m] below z = 0, after `seconds` [s]."""
     p = np.array((*xy, radius - depth))
     force = STILL

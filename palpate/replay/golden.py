@@ -107,9 +107,7 @@ def _round_value(value: Any, shift: int) -> Any:
         return [_round_value(item, shift) for item in value]
     if isinstance(value, float):
         return float(_round(np.array([value]))[0])
-    if isinstance(value, np.ndarray) and value.dtype == np.float64:
-        return _round(value)
-    return value
+    return _round(value) if isinstance(value, np.ndarray) and value.dtype == np.float64 else value
 
 
 def _round(values: Any) -> Any:

@@ -73,9 +73,7 @@ def _observers(scenario: Scenario, options: RunOptions) -> tuple[str, ...]:
     """Return recorder and dashboard, unless nothing is recorded; the dashboard only if its libraries are installed."""
     if options.record == "none":
         return ()
-    if _missing_for_dashboard(scenario):
-        return tuple(role for role in OBSERVERS if role != "dashboard")
-    return OBSERVERS
+    return tuple(role for role in OBSERVERS if role != "dashboard") if _missing_for_dashboard(scenario) else OBSERVERS
 
 
 def _missing_for_dashboard(scenario: Scenario) -> str:

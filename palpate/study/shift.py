@@ -207,9 +207,7 @@ def _ports(_: Skeleton, rng: Rng) -> list[Structure]:
     """Three or four trocars of 5 to 12 mm."""
     places = np.array(((0.0, 0.018), (0.0, 0.085), (-0.075, 0.045), (-0.085, -0.02), (0.07, -0.03)))
     chosen = rng.permutation(places)[: rng.integers(3, 5)]
-    return [
-        part for place in chosen for part in _scar(_straight(place, rng.uniform(0, np.pi), rng.uniform(0.005, 0.014), 2), rng)
-    ]
+    return [one for at in chosen for one in _scar(_straight(at, rng.uniform(0, np.pi), rng.uniform(0.005, 0.014), 2), rng)]
 
 
 def _hernia(_: Skeleton, rng: Rng) -> list[Structure]:

@@ -47,9 +47,7 @@ class FlatSlab:
         """Return rest positions [m], shape (n, 3), in z = 0 with a vertex at the origin."""
         return self.model.vertices
 
-    def press(
-        self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0.0, 0.0), profile: Profile = "sphere"
-    ) -> float:
+    def press(self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0, 0), profile: Profile = "sphere") -> float:
         """Return the force [N] on a sphere at `xy_m` whose lowest point is `depth_m` below z = 0, along the outward normal.
 
         `paraboloid` is Hertz's indenter, a sphere to second order.

@@ -211,9 +211,7 @@ class ElasticTissue(TissueBackend):
     def contact_forces(self) -> Array:
         """Return the contact forces f > 0 along the inward normals [N], shape (k,)."""
         patch = self._patch
-        if patch is None or not self.touching:
-            return np.empty(0)
-        return patch.force[patch.force > 0]
+        return np.empty(0) if patch is None or not self.touching else patch.force[patch.force > 0]
 
     @property
     def deepest(self) -> tuple[int, float]:

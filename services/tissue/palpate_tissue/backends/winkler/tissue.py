@@ -339,9 +339,7 @@ class WinklerTissue(TissueBackend):
     @property
     def inward(self) -> Array:
         """See `TissueBackend`."""
-        if self._excursion:
-            return self.displacement - self._excursion * self.model.breathing
-        return self.displacement
+        return self.displacement - self._excursion * self.model.breathing if self._excursion else self.displacement
 
     def energy(self) -> float:
         """Return the elastic energy [J] of all springs, including the Maxwell branches, and of the sheared skin."""
