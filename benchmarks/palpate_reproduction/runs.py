@@ -1,7 +1,5 @@
 """Examinations for the figures: several ways to cover the region, and a run on the bus for its graph."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

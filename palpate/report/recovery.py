@@ -111,9 +111,7 @@ class Resumption(NamedTuple):
     def summary(self) -> str:
         """Text for the user: the run, its samples, its remaining targets."""
         left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
-        return "; ".join(
-            (f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples recorded{left}", *self.damage)
-        )
+        return "; ".join((f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples{left}", *self.damage))
 
 
 def resumption(folder: Path) -> Resumption:

@@ -1,7 +1,5 @@
 """A run with all services in one child process: a service that exits, crashes or hangs does not take the command with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, MutableSequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace

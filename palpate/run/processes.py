@@ -1,7 +1,5 @@
 """Local processes of a run. The list of processes is docker-compose.yml, as for containers."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -25,6 +25,7 @@ from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import MS, UNIX_NS
 from palpate_bus.monitor import health
+from palpate_bus.monitor.health import BusTime, SeenViolation, Stream, TopicHealth, Violation
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
 from palpate_bus.wire.transport import subscribe, try_decode
@@ -36,14 +37,14 @@ class Monitor:
     def __init__(self, contract: Contract, rate: float | None = None) -> None:
         self.contract = contract
         self.rate = rate
-        self.active: dict[tuple[str, str, Kind, str], health.SeenViolation] = {}
+        self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation, by (topic, sender, kind, field)."""
-        self.time = health.BusTime(0.0, 0, None)
+        self.time = BusTime(0.0, 0, None)
         """Progress of the bus time as of the last check."""
         self.listening: frozenset[str] = frozenset(contract.topics)
         """Subscribed topics; silence of the others is not a violation."""
-        self._kept: dict[str, health.TopicHealth] = {}
-        self._streams: dict[str, dict[bytes, health.Stream]] = {name: {} for name in contract.topics}
+        self._kept: dict[str, TopicHealth] = {}
+        self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in contract.topics}
         self._checkers = {name: Checker(topic) for name, topic in contract.topics.items()}
         self._decoders = {name: codec.decoder(topic.type) for name, topic in contract.topics.items()}
         self._nodes: dict[bytes, str] = {}
@@ -51,7 +52,7 @@ class Monitor:
         """Senders that have left the bus."""
         self._publishers: dict[str, set[str]] = {}
         self._since: dict[tuple[str, str], float] = {}
-        self._news: list[health.Violation] = []
+        self._news: list[Violation] = []
 
     def listen(self, names: Iterable[str], now: float) -> None:
         """Set the subscribed topics. The last findings on the others are kept."""
@@ -95,7 +96,7 @@ class Monitor:
         topic = self.contract.topics[name]
         stream = self._streams[name].get(gid)
         if stream is None:
-            stream = self._streams[name][gid] = health.Stream(self._sender(gid), now, sequence=sequence - 1)
+            stream = self._streams[name][gid] = Stream(self._sender(gid), now, sequence=sequence - 1)
         if gid in self._nodes:
             stream.sender = self._nodes[gid]
         stream.count += 1
@@ -124,7 +125,7 @@ class Monitor:
         topic = self.contract.topics[name]
         self._note(topic, self._sender(gid), Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
 
-    def check(self, now: float, wall: int) -> list[health.Violation]:
+    def check(self, now: float, wall: int) -> list[Violation]:
         """Check rates and ages; return the violations that are new. `wall` is the wall time [ns]. Call it often."""
         for streams in self._streams.values():
             for stream in streams.values():
@@ -143,11 +144,11 @@ class Monitor:
         news, self._news = self._news, []
         return news
 
-    def health(self) -> list[health.TopicHealth]:
+    def health(self) -> list[TopicHealth]:
         """Return the health of every topic, in the contract's order."""
         return [self._health(topic) for topic in self.contract.topics.values()]
 
-    def _health(self, topic: Topic) -> health.TopicHealth:
+    def _health(self, topic: Topic) -> TopicHealth:
         streams = [stream for stream in self._streams[topic.name].values() if stream.window]
         passed = [stream.passed() for stream in streams]
         seconds = max((p.seconds for p in passed), default=0.0)
@@ -164,7 +165,7 @@ class Monitor:
         elif topic.periodic and senders and self.time.progress and seconds >= health.TUNING.grace_s:
             alive = messages > 0
         rate = messages / seconds if seconds else 0.0
-        return health.TopicHealth(
+        return TopicHealth(
             topic, tuple(senders), alive, sum(stream.count for stream in streams), rate,
             max(own, default=None),
             min((stream.ages[-1] for stream in streams if stream.ages), default=None),
@@ -181,15 +182,15 @@ class Monitor:
         return self._nodes.get(gid, f"unknown sender {gid.hex()[:8]}")
 
     def _note(self, topic: Topic, sender: str, kind: Kind, expected: str, got: str, now: float, path: str = "") -> None:
-        key, violation = (topic.name, sender, kind, path), health.Violation(topic.name, sender, kind, expected, got, path)
+        key, violation = (topic.name, sender, kind, path), Violation(topic.name, sender, kind, expected, got, path)
         if key in self.active:
             seen = self.active[key]
             seen.violation, seen.last, seen.count = violation, now, seen.count + 1
         else:
-            self.active[key] = health.SeenViolation(violation, now, now)
+            self.active[key] = SeenViolation(violation, now, now)
             self._news.append(violation)
 
-    def _check_sequence(self, topic: Topic, stream: health.Stream, sequence: int, now: float) -> None:
+    def _check_sequence(self, topic: Topic, stream: Stream, sequence: int, now: float) -> None:
         missing = sequence - stream.sequence - 1
         if missing > 0:
             stream.missing += missing
@@ -199,7 +200,7 @@ class Monitor:
             self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}", f"{sequence} again", now)
         stream.sequence = max(stream.sequence, sequence)
 
-    def _check_stamp(self, topic: Topic, stream: health.Stream, sequence: int, stamp: int, now: float) -> None:
+    def _check_stamp(self, topic: Topic, stream: Stream, sequence: int, stamp: int, now: float) -> None:
         if stream.stamp is not None and stamp < stream.stamp:
             self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: backwards", now)
         elif topic.periodic and self.rate is None and stamp != (sequence - 1) * topic.period:
@@ -265,7 +266,7 @@ class LiveMonitor:
             self._subscribers[name] = subscribe(self._session, key, zenoh.handlers.FifoChannel(ROOM), history=latched)
         self.monitor.listen(chosen, monotonic())
 
-    def poll(self) -> list[health.Violation]:
+    def poll(self) -> list[Violation]:
         """Process received messages and return new violations."""
         now = monotonic()
         self.graph.changes()

@@ -3,8 +3,6 @@
 Marks of certainty: [V] read in the source (its abstract), [A] assumed.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from typing import Annotated, Any, Literal

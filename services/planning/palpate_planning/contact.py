@@ -4,8 +4,6 @@ The sensor S reads, in its own axes, F_S = R_SW (F_contact + m (g - a)) + bias. 
 F_S - R_SW m g at rest while nothing is touched, in whatever orientations. Torques are not used.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -38,12 +38,10 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
     )
 
 
-def touch_message(t: int, touched: PublishedTouch) -> Message:
+def touch_message(t: int, touch: PublishedTouch) -> Message:
     """Return `palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
-    point = point_message(touched.p_W)
-    return SkinTouch(
-        header(t, "world"), point, touched.stroke, touched.height, touched.sigma, touched.expected, touched.expected_sigma
-    )
+    point = point_message(touch.p_W)
+    return SkinTouch(header(t, "world"), point, touch.stroke, touch.height, touch.sigma, touch.expected, touch.expected_sigma)
 
 
 def correction_message(t: int, outward: Array, sigma: Array) -> Message:
