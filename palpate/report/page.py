@@ -42,9 +42,7 @@ def read_report(folder: Path) -> Report:
     try:
         return Report.model_validate_json(read_text(path, EvidenceError))
     except FileNotFoundError as error:
-        raise EvidenceError(
-            f"{path} is not there: give the results folder of a run; for an interrupted run without a report, add --recover"
-        ) from error
+        raise EvidenceError(f"{path} is not there: give the results folder of a run, or --recover an interrupted one") from error
     except OSError as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:

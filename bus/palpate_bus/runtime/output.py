@@ -68,9 +68,8 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
     """Return the tick [ns] that a chunk covers, and its messages. Raises CodecError if it is invalid."""
     chunk = _decode(payload)
     data = chunk.data.tobytes()
-    columns = topics, stamps, sequences, lengths = [
-        column.tolist() for column in (chunk.topic, chunk.stamp, chunk.sequence, chunk.length)
-    ]
+    columns = [column.tolist() for column in (chunk.topic, chunk.stamp, chunk.sequence, chunk.length)]
+    topics, stamps, sequences, lengths = columns
     if len(set(map(len, columns))) != 1:
         raise codec.CodecError(f"{CHUNK_TYPE}: columns differ in length: {', '.join(str(len(column)) for column in columns)}")
     if sum(lengths) != len(data):
