@@ -166,9 +166,8 @@ def cycles(position: Array, inward: Array, force: Array, radius: float) -> list[
     footprint = np.sqrt(radius * min(float(np.median([np.ptp(inward[one]) for one in cycle])), radius))
     if np.median(np.diff(way[troughs])) > footprint:
         return []
-    together = max(
-        1, round(FOOTPRINT_SHARE * footprint / float(np.median([way[one.stop - 1] - way[one.start] for one in cycle])))
-    )
+    usual = float(np.median([way[one.stop - 1] - way[one.start] for one in cycle]))
+    together = max(1, round(FOOTPRINT_SHARE * footprint / usual))
     parts = [cycle[k : k + together] for k in range(0, len(cycle), together)]
     return [slice(part[0].start, part[-1].stop) for part in parts]
 

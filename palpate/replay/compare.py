@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from palpate.console import table
 from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
@@ -232,15 +233,14 @@ def as_dict(result: TopicResult) -> dict[str, Any]:
 
 def result_table(results: Mapping[str, TopicResult]) -> Table:
     """Return the comparison with a row per topic."""
-    table = Table(
-        "topic", "messages", "identical", "missing", "extra", "worst field", "difference", "allowed", "at \\[s]", box=None
-    )
+    counted = ("messages", "identical", "missing", "extra")
+    shown = table("topic", *counted, "worst field", "difference", "allowed", "at [s]")
     for result in results.values():
         worst = max(result.worst.values(), key=lambda d: d.ratio, default=None)
-        counts = [str(n) for n in (result.messages, result.identical, result.missing, result.extra)]
+        counts = [str(getattr(result, name)) for name in counted]
         cells = []
         if worst is not None:
             off = f"{worst.deviation:.3g}" if worst.deviation != float("inf") else f"{worst.recorded} -> {worst.got}"
             cells = [worst.name, off, f"{worst.tolerance:.3g}", f"{worst.stamp / NS:.3f}"]
-        table.add_row(result.topic, *counts, *cells, style=None if result.agrees else "red")
-    return table
+        shown.add_row(result.topic, *counts, *cells, style=None if result.agrees else "red")
+    return shown

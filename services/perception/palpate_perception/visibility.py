@@ -110,13 +110,11 @@ class Gaps(NamedTuple):
         return "; ".join(parts)
 
 
-def gaps(
-    missing: Array, total: int, X_CA: Array, K: Array, depth: Array, origin: tuple[int, int], image: tuple[int, int]
-) -> Gaps:
+def gaps(missing: Array, total: int, X_CA: Array, K: Array, depth: Array, origin: tuple[int, int], size: tuple[int, int]) -> Gaps:
     """Return the reasons for which cells were not in view.
 
     `missing`: points expected in those cells, in A [m], shape (m, 3); `total`: number of cells of the region; `depth`: the
-    fused window [m], whose first pixel is `origin` of an image of shape `image`.
+    fused window [m], whose first pixel is `origin` of an image of shape `size`.
     """
     if len(missing) == 0:
         return Gaps({}, 0.0)
@@ -124,7 +122,7 @@ def gaps(
     front = p_C[:, 2] > 0.01
     u, v = project(np.where(front[:, np.newaxis], p_C, (0.0, 0.0, 1.0)), K)
     row, column = np.rint(v).astype(np.intp), np.rint(u).astype(np.intp)
-    inside = front & (row >= 0) & (row < image[0]) & (column >= 0) & (column < image[1])
+    inside = front & (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
     row, column = row - origin[0], column - origin[1]
     held = inside & (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
     measured = np.full(len(missing), np.nan)
