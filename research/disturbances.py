@@ -66,7 +66,7 @@ def _drifting(sample: ForceSample, sign: float) -> ForceSample:
     return sample._replace(force=sample.force + 0.3 * sign * sample.time / 60)
 
 
-def _lengthened(length_m: float) -> Phantom:
+def _lengthen(length_m: float) -> Phantom:
     return Phantom(stiffness=Stiffness(length_m=length_m))
 
 
@@ -75,8 +75,8 @@ ROWS: Final = (
     Disturbance("persons", Phantom(kind="person")),
     Disturbance("slim persons", Phantom(kind="person", build=Build.SLIM)),
     Disturbance("obese persons", Phantom(kind="person", build=Build.OBESE)),
-    Disturbance("wall length 10 mm", _lengthened(0.010)),
-    Disturbance("wall length 20 mm", _lengthened(0.020)),
+    Disturbance("wall length 10 mm", _lengthen(0.010)),
+    Disturbance("wall length 20 mm", _lengthen(0.020)),
     Disturbance("background of 17.5 mm, cv 0.3", Phantom(background=Background(cv=0.3, correlation_m=0.0175))),
     Disturbance("two stiff rectus bands", rectus=True),
     Disturbance("no errors", errors=CLEAN),

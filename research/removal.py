@@ -48,7 +48,7 @@ INTERVAL = {"tissue's step": 6}
 
 
 @contextmanager
-def _interpreted(modules: Sequence[str]) -> Iterator[None]:
+def _interpret(modules: Sequence[str]) -> Iterator[None]:
     """Run the compiled functions of `modules` as Python."""
     changed: list[tuple[dict[str, Any], str, Any]] = []
     for name in [name for name in sys.modules if name.startswith("palpate_")]:
@@ -87,7 +87,7 @@ def measure(scenario: Scenario) -> dict[str, list[float]]:
     """Return the time of slots without each thing as a multiple of the time of those around them, over one examination."""
     tree = FrameTree(exam_input(scenario))
     run = Composed([*load_services(scenario, WORKERS), collector := Collector(tree=tree)])
-    removals: dict[str, Callable[[], Any]] = {name: partial(_interpreted, modules) for name, modules in MODULES.items()}
+    removals: dict[str, Callable[[], Any]] = {name: partial(_interpret, modules) for name, modules in MODULES.items()}
     removals |= {kind: partial(_by_rosbags, run, kind) for kind in STRUCT_CODECS}
     run.start()
 

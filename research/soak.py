@@ -124,7 +124,7 @@ def run(context: typer.Context, count: int, folder: Path) -> None:
     """Repeat `palpate run` with the remaining options until Ctrl-C or `count` examinations."""
     folder.mkdir(parents=True, exist_ok=True)
     soak = Soak()
-    with _sampled(soak, folder) as begin:
+    with _sample(soak, folder) as begin:
         for number in range(1, count + 1):
             begin(number)
             words = [*context.args, "--seed", str(number - 1), "--out", str(folder / f"{number:04d}")]
@@ -133,7 +133,7 @@ def run(context: typer.Context, count: int, folder: Path) -> None:
 
 
 @contextmanager
-def _sampled(soak: Soak, folder: Path) -> Iterator[Callable[[int], None]]:
+def _sample(soak: Soak, folder: Path) -> Iterator[Callable[[int], None]]:
     """Samples all processes once a second into soak.csv; yields the function that sets the number of the examination."""
     over, began, number = threading.Event(), monotonic(), [1]
     with (folder / SAMPLES).open("x", newline="", encoding="utf-8", buffering=1) as file:

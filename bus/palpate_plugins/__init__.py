@@ -58,7 +58,7 @@ class PluginKind(NamedTuple):
     def _installed(self) -> EntryPoints:
         return _entry_points(f"palpate.{self.kind}", tuple(sys.path))
 
-    def expected(self, choice: str) -> str:
+    def describe_allowed(self, choice: str) -> str:
         """Return what is allowed, and the likely name if `choice` has a typing error."""
         near = get_close_matches(choice, self.names(), n=1)
         suggestion = f". Did you mean {near[0]}?" if near else ""
@@ -70,7 +70,7 @@ class PluginKind(NamedTuple):
         if is_file(choice):
             self._check_file(Path(choice))
         elif choice not in self.names():
-            raise self._error(choice, self.expected(choice))
+            raise self._error(choice, self.describe_allowed(choice))
 
     def check_libraries(self, choice: str) -> None:
         """Check that the libraries of an installed plug-in are there. Imports nothing."""
@@ -102,7 +102,7 @@ class PluginKind(NamedTuple):
         """Return the entry point of an installed plug-in."""
         found = self._installed().select(name=choice)
         if not found:
-            raise self._error(choice, self.expected(choice))
+            raise self._error(choice, self.describe_allowed(choice))
         return next(iter(found))
 
     def failure(self, choice: str, error: BaseException) -> PluginError:
@@ -133,7 +133,7 @@ class PluginKind(NamedTuple):
 
     def _check_file(self, path: Path) -> None:
         if not path.is_file():
-            raise self._error(str(path), f"there is no such file; {self.expected(str(path))}")
+            raise self._error(str(path), f"there is no such file; {self.describe_allowed(str(path))}")
         try:
             tree = ast.parse(read_text(path), str(path))
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:

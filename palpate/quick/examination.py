@@ -162,7 +162,7 @@ class QuickExamination:
         next(stages)
         with suppress(StopIteration):
             while True:
-                contact = self._measured()
+                contact = self._measure_contact()
                 stage = stages.send(StrokeInput(self._count, contact, gate_open=self._open))
                 rows.append(self._period(stage, contact))
         return rows
@@ -231,7 +231,7 @@ class QuickExamination:
         self.loop.sensor.tare(self._count)
         self._zero_m = self.loop.zero(stroke)
 
-    def _measured(self) -> ContactMeasurement:
+    def _measure_contact(self) -> ContactMeasurement:
         """Return the contact as measured at the end of the latest period."""
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
         return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallEstimate(0.0, 0.0, self.loop.uncertainty_m), *measured)

@@ -193,18 +193,18 @@ class Patient:
         velocity, self._p = way / PERIOD_S, p
         if self._steps == 1:
             force, _ = self.tissue.step(self.time, p, velocity, self.radius)
-            return self._turned(force)
+            return self._to_A(force)
         total = np.zeros(3)
         for k in range(1, self._steps + 1):
             share = k / self._steps
             total += self.tissue.step(self.time - PERIOD_S * (1 - share), before + share * way, velocity, self.radius)[0]
-        return self._turned(total / self._steps)
+        return self._to_A(total / self._steps)
 
     def _tick(self) -> None:
         self._ticks += 1
         self.time = self._ticks * PERIOD_S
 
-    def _turned(self, force: Array) -> Array:
+    def _to_A(self, force: Array) -> Array:
         """Return a force in the body's axes in those of A."""
         moved = self._motion.moves and self.time > self._motion.at_s
         return np.asarray(self._motion.pose(self.time)[:3, :3] @ force) if moved else force

@@ -48,7 +48,7 @@ class Narration:
             return f"touch {max(state.stroke - self._strokes_before, 1)}/{self._outlook.touches}"
         return "search" if self._exam.searched else "scan"
 
-    def done(self, state: Any) -> float:
+    def done_share(self, state: Any) -> float:
         """Return the share of finished presses, 0 to 1. The touches before the scan do not count."""
         if state.phase in STROKE and self._touching(state):
             return 0.0
@@ -136,7 +136,7 @@ class RunDisplay:
         if exam is None:
             return
         self.begun = True
-        news, part, left = self._narration.news(exam), self._narration.part(exam), self._left(progress)
+        news, part, left = self._narration.news(exam), self._narration.part(exam), self._time_left(progress)
         felt = f"{exam.normal_force:5.2f} N   {max(exam.depth, -0.0999) * 1e3:5.1f} mm"
         facts = f"{left}   t {progress.t / NS:.0f} s   {progress.real_time_factor:.2f} x real time   {felt}"
         self._bar.update(self._task, completed=min(1.0, progress.t / NS / self._expected_s), phase=part, facts=facts)
@@ -144,15 +144,15 @@ class RunDisplay:
             return
         if news is not None:
             self._say(progress, *news)
-        elif not self._console.is_terminal and self._narration.done(exam) >= self._printed + PRINT_EVERY:
-            self._printed = self._narration.done(exam)
+        elif not self._console.is_terminal and self._narration.done_share(exam) >= self._printed + PRINT_EVERY:
+            self._printed = self._narration.done_share(exam)
             self._say(progress, part, f"{self._printed:.0%} done, {left}")
 
     def _say(self, progress: RunProgress, part: str, sentence: str) -> None:
         line = Text.assemble((f"{progress.t / NS:8.2f} s", "dim"), f"  {part:<9} {sentence}")
         self._console.print(line, soft_wrap=True)
 
-    def _left(self, progress: RunProgress) -> str:
+    def _time_left(self, progress: RunProgress) -> str:
         """Return about how long the run still takes, in wall-clock time."""
         if progress.real_time_factor <= 0:
             return ""

@@ -95,7 +95,7 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
     belief = posterior or Posterior(hand.task)
     rows: list[tuple[float, ...]] = []
     computing_s = 0.0
-    left = belief.left(hand.spent)
+    left = belief.remaining(hand.spent)
     count = hand.task.budget.presses if presses is None else presses
     while len(rows) < count and left.presses > 0 and left.seconds > 0:
         begin = perf_counter()
@@ -107,7 +107,7 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
         place, near = belief.at
         computing_s += perf_counter() - pressed + chosen - begin
         rows.append((*felt.xy, felt.depth, felt.force, hand.spent, near, belief.lump, *place))
-        left = belief.left(hand.spent)
+        left = belief.remaining(hand.spent)
     table = np.array(rows).reshape(-1, 9)
     depths, forces, seconds, nears, lumps = table[:, 2:7].T
     return Trial(table[:, :2], depths, forces, seconds, nears, lumps, table[:, 7:], computing_s / max(len(rows), 1))

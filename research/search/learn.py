@@ -88,7 +88,7 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
     def shown(self) -> int:
         """Return the action that the teacher would take."""
         task, posterior = self._env.task, self._env.posterior
-        xy, depth = policy(TEACHER)(posterior, posterior.left(0.0))
+        xy, depth = policy(TEACHER)(posterior, posterior.remaining(0.0))
         place = int(np.argmin(np.linalg.norm(task.places - xy, axis=1)))
         return place + len(task.places) * (depth > task.depth)
 

@@ -83,7 +83,7 @@ def test_the_time_left() -> None:
     whole = Outlook.of(EXAM).duration_s
 
     def left(t_s: float) -> str:
-        return display._left(RunProgress(int(t_s * NS), 0.25, Collected(), ()))
+        return display._time_left(RunProgress(int(t_s * NS), 0.25, Collected(), ()))
 
     assert left(whole - 75) == "about 5 min left"
     assert left(whole - 5) == "about 20 s left"

@@ -188,7 +188,7 @@ def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalProc
 
 
 def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(local, "_started", lambda command, environment, _: (command, environment))
+    monkeypatch.setattr(local, "_start", lambda command, environment, _: (command, environment))
     processes = read_processes(compose_file(), ROLES)
     local.start(*(processes[role] for role in LOOP))
     command, environment = local.running.pop("robot")

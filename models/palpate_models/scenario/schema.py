@@ -33,7 +33,7 @@ def _known_pattern(choice: str) -> str:
     """Validate a name. A file is checked when it is loaded, since a scenario may be read on another machine."""
     if is_file(choice) or choice in PATTERN.names():
         return choice
-    raise ValueError(PATTERN.expected(choice))
+    raise ValueError(PATTERN.describe_allowed(choice))
 
 
 class Mode(StrEnum):

@@ -227,7 +227,7 @@ class Recovery:
         self.early_end = cause
         self.skipped |= dict.fromkeys(targets, cause)
 
-    def reached(self, position: float, *, slid: bool) -> float:
+    def measured_length(self, position: float, *, slid: bool) -> float:
         """Return the path length up to which the present stroke has been measured [m]; before its first target if it has not."""
         if self.resume_at is not None:
             return self.resume_at - MOTION.end_tolerance_m

@@ -128,7 +128,7 @@ class Palpation:
         if not measures_targets(segment):
             return later
         slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
-        reached = self.recovery.reached(self._motion.along.position, slid=slid)
+        reached = self.recovery.measured_length(self._motion.along.position, slid=slid)
         behind = TUNING.unnoticed_m if self._watch.moved else 0.0
         return later.union(segment.path.targets[segment.path.visits > reached - behind].tolist())
 
@@ -147,7 +147,7 @@ class Palpation:
         """Lift off and end. A free motion ends at once: it has no wall to lift off from, and the arm may be off its path."""
         self.recovery.give_up(cause)
         if self._motion.segment.free is not None:
-            self._continue_with(_done())
+            self._continue_with(_report_done())
         elif self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
             self._interrupt()
 
@@ -254,7 +254,7 @@ class Palpation:
                 yield from self._lift()
             else:
                 yield from stroke.travel(self._motion, segment.path.length)
-        yield from _done()
+        yield from _report_done()
 
     def _after_interruption(self) -> stroke.Stages[None]:
         """Return the lift after an interruption, the rest of the segment and the remaining ones."""
@@ -296,7 +296,7 @@ class Palpation:
         while True:
             yield from stroke.lift(motion, self._height)
             if recovery.ending:
-                yield from _done()
+                yield from _report_done()
             if recovery.resume_at is None:
                 if not motion.ended:
                     yield from stroke.travel(motion, motion.segment.path.length)
@@ -424,6 +424,6 @@ def measures_targets(segment: Segment) -> bool:
     return segment.contact and not segment.touch
 
 
-def _done() -> stroke.Stages[None]:
+def _report_done() -> stroke.Stages[None]:
     while True:
         yield StrokeStage.DONE

@@ -80,13 +80,13 @@ class PlanningService(Service):
             Observation(
                 t=t,
                 reading=self._reading,
-                perceived=self._perceived(inbox),
+                perceived=self._new_surface(inbox),
                 motion=self._motion(inbox),
-                averaged=self._averaged(inbox),
+                averaged=self._mean_height(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=_stop(status, state, requests, self._commanded),
                 end=_end(requests),
-                lost=self._lost(t, inbox),
+                lost=self._disconnection(t, inbox),
                 request=self._request(inbox),
                 joint_force=0.0 if state is None else state.joint_force,
             )
@@ -119,7 +119,7 @@ class PlanningService(Service):
             "peak_force_N": self._peak_force,
         }
 
-    def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | Cause | None:
+    def _new_surface(self, inbox: Inbox) -> PerceivedAbdomen | Cause | None:
         """Return perception's newest answer, if one arrived."""
         for mesh in inbox.new("perception/surface"):
             self._mesh = mesh
@@ -143,7 +143,7 @@ class PlanningService(Service):
         received = [motion_of(message) for message in whole]  # the contract has no lengths
         return received[-1] if received and self._known.exam.breathing is not Following.IGNORE else None
 
-    def _averaged(self, inbox: Inbox) -> Array | None:
+    def _mean_height(self, inbox: Inbox) -> Array | None:
         """Return the height of the wall averaged over all images, if it arrived and belongs to the present surface."""
         heights: Array | None = None
         for message in inbox.new("perception/correction"):
@@ -162,7 +162,7 @@ class PlanningService(Service):
         depth = min(float(message.depth), self._known.limits.depth_m)  # a policy may request more
         return PressRequest(int(message.number), xy, depth, message.reason)
 
-    def _lost(self, t: int, inbox: Inbox) -> Cause:
+    def _disconnection(self, t: int, inbox: Inbox) -> Cause:
         """Return the cause if needed roles are disconnected, or the supervisor is silent for longer than a set-point is valid."""
         searching = ("search",) if self._known.exam.searched else ()
         needed = (*(NEEDED_BEFORE_TARGETS if self._exam.status.phase in BEFORE_TARGETS else NEEDED), *searching)

@@ -207,8 +207,8 @@ def test_measured_displacements_cover_the_past_only() -> None:
     breath = Breath()
     breath.receive(motion(SECOND, 0.001, 0.0), SECOND + 100 * MS)
     breath.receive(motion(SECOND + 100 * MS, 0.003, 0.0), SECOND + 200 * MS)
-    assert breath.seen(np.array([SECOND, SECOND + 50 * MS])) == pytest.approx([0.001, 0.002])
-    assert breath.seen(np.array([SECOND, SECOND + 150 * MS])) is None
+    assert breath.measured_at(np.array([SECOND, SECOND + 50 * MS])) == pytest.approx([0.001, 0.002])
+    assert breath.measured_at(np.array([SECOND, SECOND + 150 * MS])) is None
 
 
 def test_uncertainty_grows_with_age_and_previous_errors_of_forecasts() -> None:

@@ -32,7 +32,7 @@ def recover(path: Path) -> tuple[Path, tuple[str, ...]]:
     broken = _Broken(path)
     deque(broken.messages(), maxlen=0)  # the writer needs all channels first
     name = path.stem if path.is_file() else path.name
-    bag = BagWriter(path.with_name(f"{name}_recovered"), broken.found().values())
+    bag = BagWriter(path.with_name(f"{name}_recovered"), broken.channels_read().values())
     for channel, message in broken.messages():
         bag.write(channel.topic, message.data, message.log_time, message.sequence)
     bag.close()
@@ -60,7 +60,7 @@ def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
     broken, wanted = _Broken(folder), frozenset(f"/{topic}" for topic in topics)
     found = [(channel.topic, record) for channel, record in broken.messages() if channel.topic in wanted]
     held = [RecordedMessage(record.log_time, topic[1:], record.data, record.sequence) for topic, record in found]
-    channels = {name[1:]: channel for name, channel in broken.found().items()}
+    channels = {name[1:]: channel for name, channel in broken.channels_read().items()}
     if not held:
         raise ValueError(f"{folder}: holds none of {', '.join(topics)}")
     held.sort(key=attrgetter("stamp"))
@@ -83,7 +83,7 @@ class _Broken:
         self.damage: tuple[str, ...] = ()
         """Texts of the damaged parts, after `messages`."""
 
-    def found(self) -> dict[str, Channel]:
+    def channels_read(self) -> dict[str, Channel]:
         """Return the ROS 2 channels read so far, by topic: iterate over `messages` first. Raises ValueError if there are none."""
         if not self._channels:
             raise ValueError(f"{self.files[0]}: broken before the end of its first chunk, nothing to recover")

@@ -246,7 +246,7 @@ class Posterior:
         other.open, other.vain = self.open, self.vain
         return other
 
-    def left(self, spent_s: float) -> Budget:
+    def remaining(self, spent_s: float) -> Budget:
         """Return the remaining budget."""
         whole = self.task.budget
         return Budget(whole.presses - len(self.presses), whole.seconds - spent_s)

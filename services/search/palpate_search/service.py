@@ -107,7 +107,7 @@ class SearchService(Service):
         elif self._outline:
             place, depth = self._outline.pop(0), posterior.task.depth
         else:
-            place, depth = next_press(self._policy, posterior, posterior.left(self._spent_s))
+            place, depth = next_press(self._policy, posterior, posterior.remaining(self._spent_s))
         self._asked = np.asarray(place, dtype=float)
         kind, x, y = SearchRequest.DONE if self._ended else SearchRequest.PRESS, float(place[0]), float(place[1])
         point = Point(x, y, 0.0)
@@ -115,7 +115,7 @@ class SearchService(Service):
 
     def _over(self) -> str:
         """Return the reason for the end; empty while the search continues."""
-        posterior, left = self._posterior, self._posterior.left(self._spent_s)
+        posterior, left = self._posterior, self._posterior.remaining(self._spent_s)
         if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= TUNING.min_presses:
             return f"the probability of a missed lump is {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
@@ -128,7 +128,7 @@ class SearchService(Service):
 def try_policy(scenario: Scenario) -> None:
     """Ask the scenario's policy for a first press. Raises PluginError if that is not usable."""
     posterior = Posterior(Task.of(exam_input(scenario)))
-    next_press(policy(scenario.search.policy), posterior, posterior.left(0.0))
+    next_press(policy(scenario.search.policy), posterior, posterior.remaining(0.0))
 
 
 def next_press(chosen: Policy, posterior: Posterior, left: Budget) -> tuple[Array, float]:

@@ -105,11 +105,11 @@ class Batch:
 
     def verdict(self, q: Array) -> tuple[int, float]:
         """Return a score, lower is better: number of missed targets, then mean cost of the others, rounded for repeatability."""
-        reached = self.reached(q)[1]
+        reached = self.check_reached(q)[1]
         cost = self.cost(q)
         return int((~reached).sum()), round(float(cost[reached].mean()), 3) if reached.any() else 0.0
 
-    def reached(self, q: Array) -> tuple[Array, Mask]:
+    def check_reached(self, q: Array) -> tuple[Array, Mask]:
         """Return the norm of the residual (n,), and True where the target is reached with the right orientation (n,)."""
         residual = np.linalg.norm(self.task(q)[0], axis=1)
         facing = self.facing(q)
@@ -175,9 +175,9 @@ def plan_redundancy(
     limits = (model.lower_rad + joint_margin_rad, model.upper_rad - joint_margin_rad)
     batch = Batch(robot, positions_W, normals_W, limits, force_n)
     q = _inverse_kinematics(batch, q_seed)
-    better = _refine(robot, batch, q, batch.reached(q)[1])
+    better = _refine(robot, batch, q, batch.check_reached(q)[1])
     if better is not None:  # the refined postures, except for targets that only inverse kinematics reached
-        lost = batch.reached(q)[1] & ~batch.reached(better)[1]
+        lost = batch.check_reached(q)[1] & ~batch.check_reached(better)[1]
         q = np.where(lost[:, None], q, better)
     return _judge(batch, q, better is not None)
 
@@ -212,11 +212,11 @@ def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
     sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
     best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
     q = batch.from_one(best)
-    missing, reached = batch.reached(q)
+    missing, reached = batch.check_reached(q)
     if reached.any() and not reached.all():
         _, nearest = cKDTree(batch.positions[reached]).query(batch.positions)
         trial = batch.search(q[np.flatnonzero(reached)[nearest]])
-        residual, good = batch.reached(trial)
+        residual, good = batch.check_reached(trial)
         better = ~reached & (good | (residual < missing))
         q = np.where(better[:, None], trial, q)
     return q
@@ -281,7 +281,7 @@ def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
     torque = np.array(batch.functions.torque.map(batch.count)(q.T, bases, batch.force)).T
     return PostureSequence(
         q=q,
-        reachable=batch.reached(q)[1],
+        reachable=batch.check_reached(q)[1],
         margin=np.minimum(batch.arm.upper_rad - q, q - batch.arm.lower_rad).min(axis=1),
         torque_fraction=(np.abs(torque) / batch.arm.torque_nm).max(axis=1),
         dexterity=np.array(batch.functions.dexterity.map(batch.count)(q.T, bases))[0],

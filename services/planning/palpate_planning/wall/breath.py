@@ -90,7 +90,7 @@ class Breath:
         since_s = (t - self._since) / SECOND
         return forecast + max(self._gap * exp(-since_s / TUNING.join_s), self._gap - TUNING.inward_mps * since_s)
 
-    def seen(self, times: Array) -> Array | None:
+    def measured_at(self, times: Array) -> Array | None:
         """Return measured displacements [m] at past times [ns], shape (n,), or None if not measured yet."""
         if not self._seen or self._seen[0][0] > times[0] or self._seen[-1][0] < times[-1]:
             return None

@@ -269,7 +269,7 @@ class Wall:
         Returns None while the breathing is not measured. With the forecast the error of a touch is 0.5 to 1.2 mm, with measured
         breathing half of that.
         """
-        seen = self.breath.seen(onset.times)
+        seen = self.breath.measured_at(onset.times)
         if seen is None or self._touched is None:
             return None
         foot, before = self._touched
