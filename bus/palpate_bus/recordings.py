@@ -184,7 +184,7 @@ def _list_files(metadata: Path) -> tuple[Path, ...]:
         compression = str(info.get("compression_mode") or "").lower()
     except (RecordingError, LookupError, TypeError, AttributeError) as error:
         reason = str(error).partition("\n")[0]
-        raise RecordingError(f"{metadata}: is not rosbag2's metadata of a recording ({reason}); give its .mcap file") from error
+        raise RecordingError(f"{metadata}: is not rosbag2's description ({reason}); give its .mcap file") from error
     if compression == "message":
         raise RecordingError(f"{metadata}: compression_mode = message, expected none or chunks; {_convert(metadata.parent)}")
     for name, file in zip(names, files, strict=True):

@@ -54,10 +54,10 @@ def run_distributed(
     local = LocalProcesses(groups, out, files, timing, read_record(observers), secure)
     at_once = True
 
-    def ended_roles() -> dict[str, str]:
+    def ended() -> dict[str, str]:
         """Return how processes ended, with the user's file."""
         files = {role: file for role in roles if is_file(file := choice(scenario, role))}
-        return {role: f"{how} ({files[role]})" if role in files else how for role, how in local.ended_roles().items()}
+        return {role: f"{how} ({files[role]})" if role in files else how for role, how in local.ended().items()}
 
     try:
         options = local.bus["conductor"]
@@ -78,7 +78,7 @@ def run_distributed(
         try:
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, tell, ended_roles, timing, patience, begin, tree)
+                result = conduct(session, roles, tell, ended, timing, patience, begin, tree)
                 all_is_measured()
             at_once = not result.wall_time_s  # it has not begun
             if result.failure is not None:

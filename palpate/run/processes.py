@@ -281,7 +281,7 @@ class LocalProcesses:
             process_group=0,  # only the conductor receives Ctrl-C: it ends the run, and the recorder closes its files
         )
 
-    def ended_roles(self) -> dict[str, str]:
+    def ended(self) -> dict[str, str]:
         """Return how each ended process did so, by role: by a signal, or with a status and the last line of its log."""
         for role, child in self.running.items():
             if role not in self._ends and (code := child.poll()) is not None:

@@ -1,7 +1,7 @@
 """Search for the disc or ridge that stands out most from what a regression explains."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import Bounds, minimize
@@ -123,7 +123,7 @@ def _best(
         limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
         start: Array = np.clip((*points, np.log(first.radius), np.log(first.edge)), limits.lb, limits.ub)
         simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
-        options = {"initial_simplex": simplex, "maxfev": tries, "xatol": 1e-4, "fatol": 1e-2}
+        options: Any = {"initial_simplex": simplex, "maxfev": tries, "xatol": 1e-4, "fatol": 1e-2}
         found.append(minimize(loss, start, method="Nelder-Mead", bounds=limits, options=options))
     best = min(found, key=lambda one: float(one.fun))
     return shape(best.x), -float(best.fun)
