@@ -140,7 +140,7 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, kind):
         ("count.ply", ply(BOX.vertices, BOX.faces).replace(b"vertex 8", b"vertex -8"), "is not whole"),
         ("stl.ply", BOX.export(file_type="stl"), "is not whole"),
         ("ply.stl", ply(BOX.vertices, BOX.faces), "not whole, or no STL"),
-        ("x.step", "x", r"want a file in \.obj"),
+        ("x.step", "x", r"expected a file in \.obj"),
         ("junk.ply", b"\x00\x01 no mesh at all", "is not whole"),
         ("empty.obj", "# nothing\n", "no triangles|cannot be read"),
         ("points.obj", "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n", "no triangles|cannot be read"),
@@ -184,9 +184,9 @@ def test_textures_and_materials_are_not_loaded(tmp_path, capfd, name):
 @pytest.mark.parametrize(
     ("name", "turn", "words"),
     [
-        ("prone", (1, -1, -1), r"faces \(-?0, -?0, -1\), want \+z"),
+        ("prone", (1, -1, -1), r"faces \(-?0, -?0, -1\), expected \+z"),
         ("open", (1, -1, -1), "it seems to lie face down"),
-        ("y_up", None, r"faces \(.*1, .*\), want \+z"),
+        ("y_up", None, r"faces \(.*1, .*\), expected \+z"),
     ],
 )
 def test_a_body_that_does_not_face_up_is_refused(tmp_path, name, turn, words):
@@ -300,7 +300,7 @@ def test_a_shallow_patch_can_move(tmp_path):
 
 
 def test_a_lesion_beside_the_body_is_refused():
-    with pytest.raises(MeshError, match=r"phantom.lesions\[0\]: centre_m \(-55.0, 10.0\).*want metres"):
+    with pytest.raises(MeshError, match=r"phantom.lesions\[0\]: centre_m \(-55.0, 10.0\).*expected metres"):
         build_phantom(Phantom(lesions=(Lesion(centre_m=(-55.0, 10.0)),)), 0)
 
 
@@ -310,7 +310,7 @@ def test_a_lesion_beside_the_body_is_refused():
         ({"speed_mps": 500.0}, "speed_mps"),
         ({"depth_m": 20.0}, "depth_m"),
         ({"force_emergency_n": 40000.0}, "force_emergency_n"),
-        ({"workspace_min_m": (0.8, 0.0, 0.0)}, "want -3 <= min < max <= 3"),
+        ({"workspace_min_m": (0.8, 0.0, 0.0)}, "expected -3 <= min < max <= 3"),
     ],
 )
 def test_limits_without_effect_are_refused(settings, words):

@@ -46,7 +46,7 @@ def presses(name: str, count: int, task: Task = TASK) -> list[tuple[float, float
     """Return the presses of a policy on a wall with a stiff place."""
     posterior, next_press = Posterior(task), policy(name)
     for k in range(count):
-        (x, y), depth = next_press(posterior, posterior.left(3.0 * k))
+        (x, y), depth = next_press(posterior, posterior.remaining(3.0 * k))
         force = 4.0 + 6.0 * np.exp(-((x - 0.05) ** 2 + y**2) / 0.015**2)
         posterior.add(Press(float(x), float(y), depth, float(force), 3.0 * k))
     return [(p.x, p.y, p.depth) for p in posterior.presses]
@@ -88,7 +88,7 @@ def test_the_learned_policy_decides_as_its_weights_do() -> None:
     posterior = Posterior(TASK)
     for x, y, force in ((0.0, -0.03, 4.0), (0.06, -0.03, 4.2), (0.05, 0.0, 9.0), (0.0, 0.01, 4.1)):
         posterior.add(Press(x, y, TASK.depth, force, 3.0 * len(posterior.presses)))
-    place, depth = ppo(posterior, posterior.left(12.0))
+    place, depth = ppo(posterior, posterior.remaining(12.0))
     np.testing.assert_allclose(place, DECIDED, atol=1e-9)
     assert depth == TASK.deepest
 
@@ -103,7 +103,7 @@ def test_a_policy_of_a_file(tmp_path: Path) -> None:
 
 def test_a_policy_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        PluginError, match=r"search.policy = 'infromed': want one of expected-improvement, .*Did you mean informed\?"
+        PluginError, match=r"search.policy = 'infromed': expected one of expected-improvement, .*Did you mean informed\?"
     ):
         policy("infromed")
     (tmp_path / "empty.py").write_text("next = 3\n")
@@ -277,8 +277,8 @@ def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth:
 @pytest.mark.parametrize("returned", [None, 5, (1,), ((0.0, 0.0), "deep"), (("a", "b"), 0.01)])
 def test_what_is_not_a_press_is_refused(returned: Any) -> None:
     posterior = Posterior(TASK)
-    with pytest.raises(PluginError, match=r"search\.policy: returned .*, want \(place, depth\)"):
-        next_press(lambda *_: returned, posterior, posterior.left(0.0))
+    with pytest.raises(PluginError, match=r"search\.policy: returned .*, expected \(place, depth\)"):
+        next_press(lambda *_: returned, posterior, posterior.remaining(0.0))
 
 
 def test_the_report_says_what_it_took() -> None:
