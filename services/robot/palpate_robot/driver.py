@@ -205,7 +205,9 @@ class Driver:
             return
         if command.stamp > t + TUNING.ahead_ns:
             ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f}")
+            self._reject(
+                t, HoldCause.INVALID_COMMAND, f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f} ms"
+            )
             return
         interval_ms = 1.0
         if self._checked is not None:

@@ -42,7 +42,7 @@ class Profile(Section):
         """Return the topic of commands. Raises UserError if the profile has no controller of this level."""
         if level not in self.controllers:
             known = ", ".join(self.controllers)
-            raise UserError(f"robot.level: {level}: the profile has controllers for {known}; set the controller or the level")
+            raise UserError(f"robot.level: {level}: the profile offers {known}; set robot.driver.controller or robot.level")
         controller = self.controllers[level]
         return self.topic("target_pose" if level is CommandLevel.SETPOINT else f"{controller}/commands")
 
