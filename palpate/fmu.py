@@ -114,7 +114,7 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
 def simulate(
     file: Annotated[Path, typer.Argument(help="An FMU; an abdomen is probed, any other FMU is run without inputs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="PNG to write; a CSV is written next to it.")] = Path("probing.png"),
-    at: Annotated[tuple[float, float], typer.Option(help="Position of the press in the abdomen frame: x y [m].")] = (0.0, 0.05),
+    at: Annotated[tuple[float, float], typer.Option(help="Position of the press in the abdomen frame, in metres.")] = (0.0, 0.05),
     depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="Depth of the press, in metres.")] = 0.010,
     speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="Speed of the press, in m/s.")] = 0.02,
     hold: Annotated[float, typer.Option(min=0, max=60, help="Duration of the hold, in seconds.")] = 1.0,

@@ -179,4 +179,5 @@ def test_the_map_is_drawn_with_or_without_findings_and_truth(found: bool, known:
     assert outline.sum() > 400 if found else outline.sum() < 50
     drawing = Drawing(stiffness_map(), shown, truth if known else None)
     assert drawing.outlined == ("findings outlined" if found else "no finding")
-    assert drawing.truth_legend == f"no lump; {'solid: finding' if found else 'no finding'}"
+    lump = "dashed: where a lump is felt" if known else "no lump"
+    assert drawing.truth_legend == f"{lump}; {'solid: finding' if found else 'no finding'}"

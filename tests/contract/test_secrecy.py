@@ -44,7 +44,7 @@ Hand = Callable[[Scenario, Path], Mapping[str, Handout]]
 class Unstarted(LocalProcesses):
     """Records what each process is given instead of starting it."""
 
-    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Any:
+    def _start(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Any:
         file = Path(environment["PALPATE_SCENARIO"])
         files = {path.name: path.read_bytes() for path in file.parent.iterdir() if path.is_file()}
         listening = Path(environment["PALPATE_LISTEN"].partition("/")[2]).parent  # a folder of random name
