@@ -162,6 +162,12 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, 
         read_arm(write(tmp_path, **changes))
 
 
+def test_a_urdf_in_place_of_its_yaml_file_is_named(tmp_path: Path) -> None:
+    write(tmp_path)
+    with pytest.raises(UserError, match=r"arm\.urdf: is a URDF; expected the path of a YAML file .*`urdf: arm.urdf` and `flange"):
+        read_arm(str(tmp_path / "arm.urdf"))
+
+
 def test_a_home_posture_is_found(tmp_path: Path) -> None:
     arm, faults = read_arm(write(tmp_path, home_rad=None))
     assert arm is not None, faults

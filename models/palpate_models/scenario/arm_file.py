@@ -72,6 +72,11 @@ PLACEMENT: Final = ("level", "base_xy_m", "base_height_m", "base_yaw_rad", "join
 def arm_path(name: str) -> Path:
     """Return the YAML file of an arm: a path, or a name of `FOLDER`. Raises UserError."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
+    if Path(name).suffix == ".urdf" and Path(name).is_file():
+        raise UserError(
+            f"robot.arm: {name}: is a URDF; expected the path of a YAML file next to it with at least "
+            f"`urdf: {Path(name).name}` and `flange: LINK`, the link at the mounting face"
+        )
     if not path.is_file():
         known = ", ".join((DEFAULT_ARM, *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
         raise UserError(f"robot.arm: {name}: no such file; expected {known}, or the path of a YAML file")
