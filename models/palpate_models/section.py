@@ -1,5 +1,7 @@
 """Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
+from collections.abc import Collection
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -69,5 +71,22 @@ def read_model(path: Path, model: type[_M], error: type[UserError] = UserError) 
     except OSError as problem:
         raise error(f"{path}: {problem}") from problem
     except ValidationError as problem:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in problem.errors())
-        raise error(f"{path}: {wrong}") from problem
+        wrong = [
+            (e["loc"], unknown_field(str(e["loc"][-1]), model) if e["type"] == "extra_forbidden" else e["msg"])
+            for e in problem.errors()
+        ]
+        text = "; ".join(f"{'.'.join(map(str, field)) or 'the file'}: {what}" for field, what in wrong)
+        raise error(f"{path}: {text}") from problem
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """Return the most similar known word as a sentence; empty if there is none."""
+    near = get_close_matches(word, known, n=1)
+    return f". Did you mean {near[0]}?" if near else ""
+
+
+def unknown_field(field: str, model: type[BaseModel]) -> str:
+    """Return the message for a field that neither the model nor a nested one has, with the most similar field."""
+    schema = model.model_json_schema()
+    parts = (schema, *schema.get("$defs", {}).values())
+    return f"unknown field{did_you_mean(field, {name for part in parts for name in part.get('properties', ())})}"

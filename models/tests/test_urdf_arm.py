@@ -24,7 +24,7 @@ GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: Any) -> str:
     """Return the YAML file of an arm of six joints; `changes` replace parts of its third joint and link, or of the YAML file."""
     given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
-        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "wrong")
+        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "base_heigth_m")
     }
     links = ['<link name="link_0"/>']
     for k, rpy in enumerate(TWISTS, start=1):
@@ -154,7 +154,7 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
         ({"text": "<sdf/>"}, "its root element is sdf"),
         ({"text": XACRO}, "has xacro elements"),
         ({"urdf": "other.urdf"}, "other.urdf"),
-        ({"wrong": "1"}, "wrong: Extra inputs"),
+        ({"base_heigth_m": 1}, r"base_heigth_m: unknown field\. Did you mean base_height_m\?"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:

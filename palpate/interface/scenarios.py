@@ -46,7 +46,7 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
     >>> palpate.scenario("lump", exam={"dept_m": 0.008})  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):
         ...
-    ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
+    ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: unknown field. Did you mean depth_m?
     """
     given = as_settings(dict(paths(settings)))
     if isinstance(source, Scenario):

@@ -10,8 +10,9 @@ from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.runs.run_folder import name_run
 from palpate_bus.settings import Settings
-from palpate_models.scenario.load import HIDDEN, did_you_mean, dump_scenario, view_of
+from palpate_models.scenario.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services
+from palpate_models.section import did_you_mean
 from palpate_plugins import PluginError, is_file
 from palpate_search.posterior import POLICY, policy
 from palpate_search.service import try_policy

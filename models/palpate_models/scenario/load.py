@@ -4,8 +4,7 @@ Errors name file, line, field, value and what is allowed.
 """
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from difflib import get_close_matches
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -18,13 +17,7 @@ from palpate_inputs import brief, parse_yaml, read_text
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import ExamInput, PlantInput, Scenario
-from palpate_models.section import UNITS, Pose
-
-
-def did_you_mean(word: str, known: Collection[str]) -> str:
-    """Return the most similar known word as a sentence; empty if there is none."""
-    near = get_close_matches(word, known, n=1)
-    return f". Did you mean {near[0]}?" if near else ""
+from palpate_models.section import UNITS, Pose, did_you_mean, unknown_field
 
 
 def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel], error: ValidationError) -> str:
@@ -34,7 +27,7 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
         field = [str(part) for part in item["loc"]]
         what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "expected ")
         if item["type"] == "extra_forbidden":
-            what = f"there is no such field{did_you_mean(field[-1], _fields(model.model_json_schema()))}"
+            what = unknown_field(field[-1], model)
         elif item["type"] in _NO_SECTION:
             what = "expected a section, a mapping of fields"
         elif item["type"] == "missing":
@@ -65,11 +58,6 @@ def _unit(field: Sequence[str]) -> str | None:
     """Return the unit at the end of a field's name: metres for `exam.region_m.0`."""
     name = next((part for part in reversed(field) if not part.isdigit()), "")
     return UNITS.get(name.rpartition("_")[2]) if "_" in name else None
-
-
-def _fields(schema: dict[str, Any]) -> set[str]:
-    """Return the names of all fields of a model and its nested models."""
-    return {field for part in (schema, *schema.get("$defs", {}).values()) for field in part.get("properties", ())}
 
 
 def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str]) -> str:
