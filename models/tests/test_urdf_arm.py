@@ -84,6 +84,10 @@ BROKEN = {
     "triangle": ({"inertia": {"x": 0.2}}, "link link_3: inertia against the triangle inequality"),
     "not a number": ({"inertia": {"x": float("nan")}}, "link link_3: ixx is not finite"),
     "no mesh": ({"collision": '<geometry><mesh filename="no.stl"/></geometry>'}, "link link_3: mesh no.stl is not there"),
+    "no mesh in a package that is there": (
+        {"collision": '<geometry><mesh filename="package://example-robot-data/no.stl"/></geometry>'},
+        "link link_3: mesh package://example-robot-data/no.stl is not there",
+    ),
     "no limits": ({"limit": "<unlimited/>"}, "joint joint_3: no limit"),
     "empty range": ({"limit": '<limit lower="1" upper="1" velocity="2" effort="80"/>'}, "joint joint_3: its range"),
     "range within the margins": (
@@ -130,6 +134,7 @@ BROKEN = {
 
 @pytest.mark.parametrize(("changes", "named"), BROKEN.values(), ids=BROKEN)
 def test_what_is_broken_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
+    (tmp_path / "example-robot-data").mkdir()
     arm, faults = read_arm(write(tmp_path, **changes))
     assert arm is None
     assert any(named in fault for fault in faults), faults

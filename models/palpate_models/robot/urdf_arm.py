@@ -67,11 +67,11 @@ def _resolve(name: str, folder: Path) -> Path:
     if not name.startswith("package://"):
         return folder / name.removeprefix("file://")
     package, _, rest = name.removeprefix("package://").partition("/")
-    roots = [*folder.resolve().parents, *(Path(entry) / "cmeel.prefix" / "share" for entry in sys.path)]
-    found = next((root / package / rest for root in (folder.resolve(), *roots) if (root / package / rest).is_file()), None)
-    if found is None and package == "example-robot-data":
+    above = (folder.resolve(), *folder.resolve().parents)
+    roots = [*above, *(Path(entry) / "cmeel.prefix" / "share" for entry in sys.path)]
+    if package == "example-robot-data" and not any((root / package).is_dir() for root in roots):
         raise UserError("this arm needs the package example-robot-data: pip install 'palpate[arms]'")
-    return found or folder / package / rest
+    return next((root / package / rest for root in roots if (root / package / rest).is_file()), folder / package / rest)
 
 
 def _coal() -> Any:
