@@ -140,6 +140,20 @@ def test_what_is_broken_is_named(tmp_path: Path, changes: dict[str, Any], named:
     assert any(named in fault for fault in faults), faults
 
 
+@pytest.mark.parametrize(
+    ("changes", "faults"),
+    [
+        ({"limit": "<unlimited/>"}, ["lower", "upper", "velocity", "effort"]),
+        ({"inertia": {"m": -1.0}}, ["mass is -1 kg"]),
+        ({"inertia": {"m": 0.0}}, ["mass is 0 kg"]),
+    ],
+)
+def test_a_fault_is_named_once(tmp_path: Path, changes: dict[str, Any], faults: list[str]) -> None:
+    found = read_arm(write(tmp_path, **changes))[1]
+    assert len(found) == len(faults), found
+    assert all(named in fault for named, fault in zip(faults, found, strict=True)), found
+
+
 def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
     import trimesh
 

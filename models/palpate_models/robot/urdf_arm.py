@@ -197,8 +197,8 @@ class _Reader(UrdfTree):
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> Array:
-        """Return lower and upper position, speed and torque limits, shape (4, n)."""
-        table = np.zeros((4, len(moving)))
+        """Return lower and upper position, speed and torque limits, shape (4, n); NaN where one is missing."""
+        table = np.full((4, len(moving)), np.nan)
         for k, joint in enumerate(moving):
             limit, name = joint.find("limit"), joint.get("name")
             self.part = f"joint {name}"
@@ -213,10 +213,10 @@ class _Reader(UrdfTree):
                 else:
                     table[row, k] = self.numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
-            if not upper - lower > (least := 2 * Limits().joint_margin_rad):
+            if upper - lower <= (least := 2 * Limits().joint_margin_rad):
                 self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad, expected more than {least:g} rad")
             for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
-                if not value > 0:
+                if value <= 0:
                     self.faults.append(f"joint {name}: {field} is {value:g}, expected more than 0")
         return table
 
@@ -268,7 +268,7 @@ class _Reader(UrdfTree):
         name, total = group[0][0], sum(mass for mass, _, _ in parts)
         fixed = name == self._base
         if total <= 0:
-            if not fixed:
+            if not (fixed or parts):
                 self.faults.append(f"link {name}: no mass")
             return Inertia(1.0, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))  # the base does not move
         centre = sum(mass * p for mass, p, _ in parts) / total
