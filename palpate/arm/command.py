@@ -43,8 +43,9 @@ def check(arm: Name) -> None:
     console.print(table)
     elbow, _ = found.elbow
     shapes = sum(map(len, found.capsules))
-    parts = f"flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes"
-    console.print(f"{found.joints} joints, {parts}")
+    mass = sum(inertia.mass for inertia in found.inertias[1:])
+    parts = f"flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} collision shapes"
+    console.print(f"usable: {found.joints} joints, {mass:.1f} kg without its base, {parts}", soft_wrap=True)
 
 
 @app.command()

@@ -18,3 +18,4 @@ def test_a_flange_that_points_into_the_arm_is_refused(tmp_path: Path, turn: floa
     result = CliRunner().invoke(app, ["check", str(file)])
     assert result.exit_code == status, result.output
     assert ("touch" in result.output) is bool(status)
+    assert ("usable: 6 joints, 17.0 kg" in result.output) is not bool(status)
