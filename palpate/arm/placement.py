@@ -39,7 +39,7 @@ PLACEMENT: Final = PlacementTuning()
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
 """Minimum and maximum x, y and height [m] and yaw [rad] of the base."""
 STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))
-"""Placements to start from; the best result counts, as the problem is not convex."""
+"""Placements to start from, after the robot's own; the best result counts, as the problem is not convex."""
 
 
 def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:
@@ -68,20 +68,27 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
     """Return the robot on the base placement with the lowest cost over the scenario's region.
 
-    It is rounded to centimetres and hundredths of a radian. Raises RunError if no start converges.
+    It is rounded to centimetres and hundredths of a radian. Raises RunError with the best attempt if no start converges.
     """
     contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
     raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
-    found = [_optimise(scenario.robot, positions, normals, np.array(start)) for start in STARTS]
-    placements = [placement for placement in found if placement is not None]
-    if not placements:
-        raise RunError("no base placement found from any start")
-    return min(placements, key=itemgetter(0))[1]
+    starts = (base_of(scenario.robot), *map(np.array, STARTS))
+    attempts = [_optimise(scenario.robot, positions, normals, start) for start in starts]
+    cost, robot = min(attempts, key=itemgetter(0))
+    if cost < np.inf:
+        return robot
+    home = arm_of(robot).home_rad
+    tried = [(robot, plan_redundancy(robot, positions, normals, home)) for _, robot in attempts]
+    best = describe(*max(tried, key=lambda pair: pair[1].reachable.sum()))
+    raise RunError(
+        f"no base placement found; the best attempt is at {best}. The robot's base_xy_m, base_height_m and base_yaw_rad are "
+        "tried first: give others, or a smaller exam.region_m"
+    )
 
 
-def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> tuple[float, Robot] | None:
-    """Return the cost [1] before rounding and the placed robot from one start by Ipopt; None if it does not converge."""
+def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> tuple[float, Robot]:
+    """Return the cost [1] before rounding, infinite without convergence, and the placed robot from one start by Ipopt."""
     ca = casadi()
     count = len(positions)
     model, functions = arm_of(robot), arm(robot)
@@ -109,10 +116,8 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
         lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
         ubg=np.concatenate((zeros, [TABLE.x_m[0] - PLACEMENT.clearance_m], np.zeros(count))),
     )
-    if not solver.stats()["success"]:
-        return None
     solution = np.array(result["x"])[:, 0]
-    return float(result["f"]), _standing(robot, np.round(solution[:4], 2))
+    return float(result["f"]) if solver.stats()["success"] else np.inf, _standing(robot, np.round(solution[:4], 2))
 
 
 def _standing(robot: Robot, base: Array) -> Robot:
