@@ -28,7 +28,8 @@ def check(arm: Name) -> None:
 
     found, faults = check_arm(arm)
     if found is not None and (pairs := _touching(arm)):
-        advice = "is the flange in front of the arm, with z out of it?"
+        advice = "is the flange in front of the arm, with z out of it? A shape is one capsule about a link's meshes: a link "
+        advice += "further out as the flange helps"
         found, faults = None, [f"home_rad: {pair} touch: {advice}" for pair in pairs]
     for fault in faults:
         say(f"{arm}: {fault}")
