@@ -51,8 +51,6 @@ class SensesTuning(NamedTuple):
     torque_sd_share: float = 0.005
     """SD of a joint's external torque over its torque (friction) and over the change of that from its mean of the last `tare_s`
     in free air (errors of mass), with a torque sensor: after a fast motion the offset is still that of another posture."""
-    offset_share: float = 0.0
-    """Offset of a joint over its load that errors of mass and of the torque's gain explain."""
     damping_nms: float = 2.0
     """Error of the joints' damping [N m s/rad], twice that of typical equipment: in fast motion the joints feel less exactly."""
     force_max_n: float = 100.0
@@ -70,7 +68,7 @@ class SensesTuning(NamedTuple):
 
 
 BY_SENSORS: Final = SensesTuning()
-BY_CURRENT: Final = BY_SENSORS._replace(torque_sd_share=0.04, offset_share=0.08)
+BY_CURRENT: Final = BY_SENSORS._replace(torque_sd_share=0.04)
 """Limits for an arm that takes positions: its torques are those of the drives' currents, with the friction of the gears."""
 Arrays = tuple[Array, Array, Array]
 
@@ -98,7 +96,7 @@ class ForceComparison(NamedTuple):
     remainder: float
     """Maximum external torque of a joint that no force at the tool explains, in standard deviations."""
     offset_nm: float
-    """Maximum offset of a joint, beyond what its load explains."""
+    """Maximum offset of a joint."""
     drift: float
     """Change of the F/T bias since the arm first moved."""
     gain: float
@@ -226,6 +224,5 @@ def _compare(
     noise, rest_noise = np.sqrt(max(sums[2], 0.0)), np.sqrt(max(sums[3], 0.0))
     sums[4] += smooth * (np.abs(qd).max() - sums[4])
     joint_sd = np.hypot(1.0, tuning.damping_nms * sums[4] / tuning.torque_sd_nm) / np.sqrt(np.linalg.eigvalsh(information)[0])
-    beyond = (np.abs(offset) - tuning.offset_share * np.abs(usual)).max()
-    forces = _norm(joints_W), _norm(difference_W), remainder, beyond, drift
+    forces = _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift
     return *forces, gain, sums[1], noise, rest_noise, joint_sd

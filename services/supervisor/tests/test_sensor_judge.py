@@ -15,7 +15,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_supervisor.judge import EXAM, FT, JOINTS, DepthAgreement, MotionAgreement, SensorJudge
-from palpate_supervisor.senses import BY_CURRENT, BY_SENSORS, ForceComparison, ForceSenses, Measurement, SensesTuning
+from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement
 from palpate_supervisor.tool import ToolSense
 
 ROBOT = exam_input(load_scenario("clean")).robot
@@ -132,17 +132,6 @@ def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_l
         sd.append(senses.compare(reading, np.zeros(6), J, np.zeros(3), R_WS, 0.0, DT, (t < 1.0, True)).joint_sd)
     assert sd[310] > 2 * sd[-1]
     assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
-
-
-@pytest.mark.parametrize(("tuning", "beyond_nm"), [(BY_SENSORS, 8.0), (BY_CURRENT, 1.6)])
-def test_the_load_of_a_joint_explains_a_part_of_its_offset_if_torques_are_those_of_currents(
-    tuning: SensesTuning, beyond_nm: float
-) -> None:
-    senses, residual = ForceSenses(6, tuning), np.array((8.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    reading = Measurement(np.zeros(6), np.zeros(6), np.zeros(6), np.array((-80.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
-    for _ in range(100):
-        found = senses.compare(reading, residual, 0.6 * np.eye(3, 6), np.zeros(3), R_WS, 0.0, DT, (True, True))
-    assert found.offset_nm == pytest.approx(beyond_nm, abs=0.1)
 
 
 def test_joints_that_turn_fast_are_trusted_less() -> None:
