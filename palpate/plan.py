@@ -42,7 +42,6 @@ def plan(
     from palpate.run.inputs import check_usable
     from palpate_models.patient.phantom import build_phantom
     from palpate_planning.motion.planner import NoPathError
-    from palpate_planning.strokes.segments import REACH
 
     if out.suffix.lower() != ".png":
         refuse(f"--out {out}: expected the name of a .png file")
@@ -54,8 +53,7 @@ def plan(
             planned = run_guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
             draw(out, chosen, phantom, planned)
     except NoPathError as error:
-        hint = f"; to find where the base should stand: palpate arm place {chosen.robot.arm} {scenario}"
-        refuse(f"{error}{hint if REACH.text in str(error) else ''}")
+        refuse(f"{error}; to find where the base should stand: palpate arm place {chosen.robot.arm} {scenario}")
     console = SteadyConsole()
     console.print(summary(chosen.exam, planned), soft_wrap=True)
     for reason, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
