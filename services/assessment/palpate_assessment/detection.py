@@ -36,7 +36,7 @@ class Muscle(NamedTuple):
 
 
 class DetectionTuning(NamedTuple):
-    """Which shapes join the model, and what is believed of them."""
+    """Limits for shapes that join the model, and for what is believed of them."""
 
     max_lumps: int = 4
     """Maximum number of lumps where there is probably no bone."""

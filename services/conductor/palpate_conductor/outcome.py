@@ -14,12 +14,20 @@ from palpate_models.scenario.schema import Exam
 
 log = logging.getLogger(__name__)
 
-MIN_SAMPLED = 0.9
-"""Minimum share of the samples that are due; with fewer the examination is not complete."""
-SAMPLE_EVERY_M = 0.01
-"""Travel within which a sample is due [m], twice that of the default assessment."""
 SIM_LIMIT = 3600 * NS
 """Simulated time [ns] after which a run is ended in any case."""
+
+
+class SamplingLimits(NamedTuple):
+    """Samples that a complete examination has."""
+
+    min_share: float = 0.9
+    """Minimum share of the samples that are due."""
+    every_m: float = 0.01
+    """Travel within which a sample is due [m], twice that of the default assessment."""
+
+
+SAMPLING = SamplingLimits()
 
 
 class Timing(NamedTuple):
@@ -167,7 +175,7 @@ def unsampled(collected: Collected, exam: Exam) -> Failure | None:
     if last is None or last.phase != ExamState.PHASE_DONE or exam.searched:
         return None
     felt = int(last.target_count - last.targets_skipped)
-    if samples >= MIN_SAMPLED * felt * min(1.0, exam.spacing_m / SAMPLE_EVERY_M):
+    if samples >= SAMPLING.min_share * felt * min(1.0, exam.spacing_m / SAMPLING.every_m):
         return None
     if not samples and any(state.steady for state in collected.exam_states):  # an assessment that publishes none
         return None

@@ -117,7 +117,7 @@ def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
 
 WEIGHT = KNOWN.robot.tool_mass_kg * GRAVITY
 STRAIGHT_DOWN = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-"""Where the F/T sensor reads the weight of the tool at home."""
+"""Readings of the tool's weight by the F/T sensor at home."""
 
 
 def sensed(sense: ToolSense, wrench: np.ndarray, qd: float = 0.0) -> Tool:
