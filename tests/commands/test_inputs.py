@@ -28,7 +28,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         raise AssertionError(f"started {words}")
 
     monkeypatch.setattr(subprocess, "run", started)
-    monkeypatch.setattr(subprocess, "Popen", started)
+    monkeypatch.setattr(subprocess.Popen, "__init__", started)
     monkeypatch.setattr("palpate_benchmarks.bench.run_cases", started)
     monkeypatch.chdir(tmp_path)
 
