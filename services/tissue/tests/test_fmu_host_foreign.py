@@ -245,7 +245,7 @@ def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contrac
         ("  speed: {vector.x: {value: 0.25}}\n", "", ("lacks topics", "speed")),
         ("{value: 0.25}", "{value: 0.25, variable: y}", ("exactly one of",)),
         ("{value: 0.25}", "{scenario: X_WA}", ("the scenario gives only nothing",)),
-        ("frame: body", "frames: body", ("frames", "not permitted")),
+        ("frame: body", "frames: body", ("frames", "Did you mean frame?")),
     ],
 )
 def test_a_map_that_does_not_fit_is_refused_with_what_is_allowed(
