@@ -237,7 +237,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence number and the digest over all messages sent."""
 
-    __slots__ = ("_digest", "_unchained", "check", "encode", "event", "latched", "passed", "period", "sequence", "topic")
+    __slots__ = ("_check", "_digest", "_unchained", "encode", "event", "latched", "passed", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -245,7 +245,7 @@ class OutputPort:
         self.event = topic.event
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
-        self.check = PortCheck(topic, sends=True)
+        self._check = PortCheck(topic, sends=True)
         self.passed: Callable[[Message], Message | None] | None = None
         """Makes the message for readers in this process."""
         self.sequence = 0
@@ -255,7 +255,9 @@ class OutputPort:
 
     def pack(self, message: Message, t: int) -> Outgoing:
         """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
-        self.check(message, t)
+        check = self._check
+        if not check.conforms(message, check.past, t):
+            raise check.refusal(message, t)
         sequence = self.sequence = self.sequence + 1
         payload = self.encode(message)
         if self._digest is not None:
@@ -304,12 +306,14 @@ class Stepper:
             periodic = ()
         self._steady = tuple(port for port in periodic if port.period == self.role.period)
         self._rarer = tuple(port for port in periodic if port.period != self.role.period)
-        self._chain_every = max(_CHAIN_NS // self.role.period, 1)
+        self._period = self.role.period
+        self._chain_every = max(_CHAIN_NS // self._period, 1)
 
     def start(self) -> list[Outgoing]:
         """Return the latched messages, packed, with stamp zero."""
-        sent = []
-        for name, message in self._items(self.service.start()):
+        sent, outbox = [], self.service.start()
+        self._check_outbox(outbox)
+        for name, message in outbox.items():
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, which is not a latched topic")
@@ -348,7 +352,7 @@ class Stepper:
 
     def _close(self, t: int) -> None:
         """Check that all messages due at `t` [ns] were sent; hash if enough have gathered, now that they are on their way."""
-        number = t // self.role.period + 1
+        number = t // self._period + 1
         for port in self._steady:
             if port.sequence != number:
                 raise self._missing(port, t)
@@ -366,18 +370,18 @@ class Stepper:
         due = f"it is due every {port.period} ns; a topic that not every implementation sends is an `event` in contract.yaml"
         return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: {due}")
 
-    def _items(self, outbox: Outbox) -> Iterable[tuple[str, Message | list[Message]]]:
-        """Return the topics and messages of what the service returned. Raises LockstepError if that is not an outbox."""
-        try:
-            return outbox.items()
-        except AttributeError:
+    def _check_outbox(self, outbox: Outbox) -> None:
+        """Raise LockstepError if what the service returned is not an outbox."""
+        if not hasattr(outbox, "items"):
             kind = type(outbox).__name__
-            raise LockstepError(f"{self.role.name} returned {kind}; expected an outbox: a dict of topics and messages") from None
+            raise LockstepError(f"{self.role.name} returned {kind}; expected an outbox: a dict of topics and messages")
 
     def _pack_outbox(self, outbox: Outbox, t: int) -> list[Outgoing]:
+        if outbox.__class__ is not dict:
+            self._check_outbox(outbox)
         sent: list[Outgoing] = []
         ports = self.ports
-        for name, message in self._items(outbox):
+        for name, message in outbox.items():
             port = ports.get(name) or self._port(name)
             if port.event:
                 sent += self._pack_messages(port, message if isinstance(message, list) else (message,), t)

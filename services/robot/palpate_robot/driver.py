@@ -198,7 +198,7 @@ class Driver:
             self.mode = DriverMode.ACTIVE
 
     def _check(self, t: int, command: Command, q: Array, gravity: Array) -> None:
-        shape, expected = np.shape(command.values), (self._arm.joints,)
+        shape, expected = command.values.shape, (self._arm.joints,)
         if shape != expected:
             what = "position" if self._positions else "torque"
             self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {what} of shape {shape}, expected {expected}")

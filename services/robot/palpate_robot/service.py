@@ -114,11 +114,10 @@ class RobotService(Service):
             joints.update(plant.q, plant.v, driven)
             self._drive_torques.append(driven)
             self._friction_torques.append(plant.friction)
-            damped = -damping * joints.v
             if self._loop is not None:
-                self._applied = torque + damped
+                self._applied = torque - damping * joints.v
             else:
-                self._applied = torque if driver.mode is DriverMode.ACTIVE else damped
+                self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * joints.v
 
     def _act(self, values: Array, gravity: Array) -> tuple[Array, Array]:
         """Return torque without gravity [N m] and damping [N m s/rad] of a step, for the values that the driver applies."""

@@ -17,7 +17,7 @@ from palpate_models.scenario import press
 
 def require_finite(motion: Array) -> None:
     """Raise ValueError unless the sphere's motion is finite: rows position [m], velocity [m/s], angular velocity [rad/s]."""
-    if not isfinite(motion.sum()):
+    if not isfinite(sum(motion.ravel().tolist())):
         raise ValueError(f"tissue: position, velocity, angular velocity of the indenter are not finite: {motion.tolist()}")
 
 

@@ -128,11 +128,12 @@ class TissueService(Service):
         motion_W = np.array((p.x, p.y, p.z, 1.0, v.x, v.y, v.z, 0.0, w.x, w.y, w.z, 0.0)).reshape(3, 4)
         p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
         for at, place in self._path(t, nanoseconds(tool.header.stamp), p_A):
-            F_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
+            force_A, torque_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
             self._t, self._p_A = at, place
-        if not np.any(F_A):  # a zero without a sign
+        F_A = np.array((force_A, torque_A))
+        if not F_A.any():  # a zero without a sign
             return np.zeros(6)
-        F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
+        F_W: Array = F_A.dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
         return F_W
 
     def _path(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:

@@ -157,8 +157,8 @@ class DartPlant:
         self._clearance = Clearance(self._links, shapes, boxes(robot), stops)
         self._free_travel = 0.0  # sum of angles [rad] that the joints may turn before a contact is possible
         self._check_in = 0  # steps until the next clearance check
-        self._viscous = (robot.joint_damping_nms * drawn.damping).tolist()
-        self._coulomb = (robot.joint_friction_nm * drawn.friction).tolist()
+        self._viscous = robot.joint_damping_nms * drawn.damping
+        self._coulomb = robot.joint_friction_nm * drawn.friction
         self._cached_state: Array | None = None
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
@@ -194,13 +194,9 @@ class DartPlant:
         `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
-        joints = zip(self._set_damping, self.v.tolist(), damping.tolist(), self._viscous, self._coulomb, strict=True)
-        slopes = []
-        for set_damping, v, extra, viscous, coulomb in joints:
-            speed = abs(v)
-            slope = viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS)
+        slopes = self._viscous + damping + self._coulomb / np.maximum(np.abs(self.v), STICK_RADPS)
+        for set_damping, slope in zip(self._set_damping, slopes.tolist(), strict=True):
             set_damping(slope)
-            slopes.append(slope)
         self._arm.setForces(torque)
         if force_W is not None:
             self._indenter.addExtForce(force_W)  # at its origin, in world axes
@@ -216,7 +212,7 @@ class DartPlant:
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self.friction = np.array(slopes) * self.v
+        self.friction = slopes * self.v
         self._cached_state = None
 
     def _is_clear(self) -> bool:
