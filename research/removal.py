@@ -22,9 +22,9 @@ from rich.table import Table
 
 from palpate.run.composed import load_services
 from palpate.run.roles import WORKERS
+from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import MS
-from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.runtime.composed import Composed
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_models.scenario.load import exam_input, load_scenario
@@ -83,12 +83,16 @@ def _by_rosbags(run: Composed, kind: str) -> Iterator[None]:
             buffer.decode = codec.decoder(kind)
 
 
+FAST_TYPES = sorted({topic.type for topic in contract().topics.values() if topic.period_ms == 1})
+"""Types of the 1 kHz topics."""
+
+
 def measure(scenario: Scenario) -> dict[str, list[float]]:
     """Return the time of slots without each thing as a multiple of the time of those around them, over one examination."""
     tree = FrameTree(exam_input(scenario))
     run = Composed([*load_services(scenario, WORKERS), collector := Collector(tree=tree)])
     removals: dict[str, Callable[[], Any]] = {name: partial(_interpret, modules) for name, modules in MODULES.items()}
-    removals |= {kind: partial(_by_rosbags, run, kind) for kind in STRUCT_CODECS}
+    removals |= {kind: partial(_by_rosbags, run, kind) for kind in FAST_TYPES}
     run.start()
 
     def slot() -> float:

@@ -1,10 +1,9 @@
 """Encodes and decodes ROS 2 messages as little-endian CDR with its four-byte encapsulation header.
 
-Types of the 1 kHz topics have faster codecs (`struct_codecs`) with identical bytes; rosbags handles the others.
+`cdr` generates an encoder and a decoder for each type. Their bytes are those of rosbags, which reads big-endian messages.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from operator import attrgetter
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS, fit
+from palpate_bus.messages.cdr import ENCAPSULATION, compile_decoder, compile_encoder
 from palpate_bus.messages.typestore import CodecError, array_dtype, definition, message_type, store, type_hash
 
 __all__ = ["CodecError", "Message", "decode", "decoder", "definition", "encode", "encoder", "message_type", "store", "type_hash"]
@@ -36,8 +35,7 @@ def decode(payload: bytes | memoryview, name: str) -> Message:
 def encoder(name: str) -> Callable[[Message], bytes]:
     """Return `encode` for one type, for hot paths."""
     message_type(name)
-    fast = STRUCT_CODECS.get(name)
-    encode_message = fast.encode if fast else _rosbags_encoder(name)
+    encode_message = compile_encoder(name)
 
     def encode(message: Message) -> bytes:
         try:
@@ -52,13 +50,13 @@ def encoder(name: str) -> Callable[[Message], bytes]:
 def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
     """Return `decode` for one type, for hot paths."""
     message_type(name)
-    fast = STRUCT_CODECS.get(name)
+    decode_message = compile_decoder(name)
 
     def decode(payload: bytes | memoryview) -> Message:
         try:
-            if fast is None or payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages too
+            if payload[:2] != _LITTLE_ENDIAN:  # rosbags reads big-endian messages
                 return store.deserialize_cdr(memoryview(payload), name)
-            message, end = fast.decode(bytes(payload))
+            message, end = decode_message(bytes(payload))
             if not 0 <= len(payload) - end < 4:  # some encoders pad the end to a multiple of four
                 raise ValueError(f"the message ends at {end}")
         except Exception as error:
@@ -112,34 +110,6 @@ def _exact(name: str, but: frozenset[str] = frozenset()) -> bool:
     return True
 
 
-def _rosbags_encoder(name: str) -> Callable[[Message], bytes]:
-    has_arrays = bool(_array_fields(name) or _fields_with_arrays(name))
-
-    def encode(message: Message) -> bytes:
-        return bytes(store.serialize_cdr(_with_fitted_arrays(message, name) if has_arrays else message, name))
-
-    return encode
-
-
-def _with_fitted_arrays(message: Message, name: str, path: str = "") -> Message:
-    """Return the message with arrays in the types and layouts of its fields: rosbags copies an array's bytes unchanged."""
-    changed: dict[str, Any] = {}
-    for field, dtype, length in _array_fields(name):
-        value = getattr(message, field)
-        array = fit(value, dtype, length, path + field)
-        if array is not value:
-            changed[field] = array
-    for field, nested, repeated in _fields_with_arrays(name):
-        value = getattr(message, field)
-        if repeated:
-            changed[field] = [_with_fitted_arrays(item, nested, f"{path}{field}.") for item in value]
-        else:
-            inner = _with_fitted_arrays(value, nested, f"{path}{field}.")
-            if inner is not value:
-                changed[field] = inner
-    return replace(message, **changed) if changed else message
-
-
 @cache
 def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...]:
     """Return name, type and length (None: any) of each array of numbers in a message type, without nested messages."""
@@ -149,16 +119,4 @@ def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...
             item_kind, item = detail[0]
             if item_kind == Nodetype.BASE and item[0] != "string":
                 found.append((field, array_dtype(item[0]), detail[1] if kind == Nodetype.ARRAY else None))
-    return tuple(found)
-
-
-@cache
-def _fields_with_arrays(name: str) -> tuple[tuple[str, str, bool], ...]:
-    """Return (name, type, is a sequence) of each nested message field whose type has arrays of numbers."""
-    found = []
-    for field, (kind, detail) in store.get_msgdef(name).fields:
-        repeated = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-        item_kind, item = detail[0] if repeated else (kind, detail)
-        if item_kind == Nodetype.NAME and (_array_fields(item) or _fields_with_arrays(item)):
-            found.append((field, item, repeated))
     return tuple(found)

@@ -5,6 +5,7 @@ from contextlib import nullcontext, suppress
 from typing import Any
 
 from palpate_bus.contract import Contract, Topic, contract as default_contract
+from palpate_bus.messages import codec
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import Outgoing, Stepper, run_hash
@@ -53,6 +54,9 @@ class Composed:
         numbers = {role: number for number, role in enumerate(contract.roles)}
         self._numbers = {stepper: numbers[role] for role, stepper in self.steppers.items()}
         self._taps = tuple(taps)
+        for stepper in self.steppers.values():
+            for port in stepper.ports.values():
+                port.here, port.passed = not taps, codec.passer(port.topic.type)
         self._started = False
         self.t = 0
         self.lost: dict[str, int] = {}

@@ -112,6 +112,11 @@ class ImpedanceController:
         self._cartesian_gains: CartesianGains  # designed in the first tick, as the joint gains
         self._joint_gains: JointGains
 
+    @property
+    def peak(self) -> Array:
+        """Largest magnitude of each torque so far [N m], shape (n,)."""
+        return self._net.peak
+
     def reset(self) -> None:
         """Restart the rate limit from zero torque, after a pause without commands."""
         self._net.reset()

@@ -24,6 +24,8 @@ class SafetyNet:
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
         self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit))
+        self.peak = np.zeros_like(torque_limit)
+        """Largest magnitude of each torque so far [N m], shape (n,)."""
         self._rate = TORQUE_RATE_NM_PER_MS * period_s / 1e-3
         self._last = np.zeros_like(torque_limit)
 
@@ -37,14 +39,16 @@ class SafetyNet:
         The torque, and the torque plus `gravity`, are within limits.
         """
         safe = np.empty_like(self._last)
-        safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, safe)
+        safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, self.peak, safe)
         self._last = safe
         return safe
 
 
 @compiled
-def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: Array, safe: Array) -> None:
-    """Set `safe` [N m], shape (n,), to `wanted` plus repulsion from joint limits, within all limits.
+def safe_torque(
+    wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: Array, peak: Array, safe: Array
+) -> None:
+    """Set `safe` [N m], shape (n,), to `wanted` plus repulsion from joint limits, within all limits; keep the `peak` magnitude.
 
     It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. Rows of `joints`: middle of each
     joint range [rad], angle from it at which the repulsion begins [rad], its gain [N m/rad^2], torque limit [N m].
@@ -56,3 +60,4 @@ def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: floa
     low = np.maximum(np.maximum(-limit, -limit - gravity), last - rate)
     high = np.minimum(np.minimum(limit, limit - gravity), last + rate)
     safe[:] = np.minimum(np.maximum(wanted - np.sign(off) * repulsion, low), high)
+    peak[:] = np.maximum(peak, np.abs(safe))

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Mapping
-from math import isfinite
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -72,7 +71,7 @@ class ControlService(Service):
         self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
         self._facts = dict.fromkeys(("setpoints", "setpoints_rejected", "ticks_without_joint_states", "ticks_without_command"), 0)
-        self._peak, self._last = self._still.copy(), self._still
+        self._last = self._still
         self._last_expires = -1
         """Expiry of the last command [ns]."""
         self._began: int | None = None
@@ -120,23 +119,23 @@ class ControlService(Service):
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
         q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
-        if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
-            wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}, finite"
+        if not (joints.name == self._names and q.shape == qd.shape == self._still.shape):
+            wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}"
             return self._stop_commands(t, Problem("joint_states", wrong))
         if self._admittance is not None and (stale := self._sense(self._admittance, t, inbox)):
             return self._repeat(t, stale)
         reference = self._reference.at(followed)
         command = self._controller.command(q, qd, reference)
-        if not self._positions:
-            np.maximum(self._peak, np.abs(command), out=self._peak)
         self._last, self._last_expires = command, t + self._command_expiry
         far = self._too_far(reference.setpoint, q)
         return self._stop_commands(t, Problem(TOPIC, far)) if far else self._command(t, command, self._full_validity)
 
     def finish(self) -> Mapping[str, Any]:
         """Return counts of set-points and rejections, the last problem, and the largest torques [N m] if it commands torques."""
-        peak = {} if self._positions else {"peak_torque_nm": [round(float(x), 3) for x in self._peak]}
-        return {**self._facts, "problem": self._problem, **peak}
+        facts = {**self._facts, "problem": self._problem}
+        if isinstance(self._controller, ImpedanceController):
+            facts["peak_torque_nm"] = [round(float(x), 3) for x in self._controller.peak]
+        return facts
 
     def _accept(self, message: Message, t: int) -> None:
         """Check a set-point and queue it until joint states as late as its stamp arrive; the first one is applied at once."""
@@ -145,10 +144,6 @@ class ControlService(Service):
         if counts != {self.model.joints}:
             names = "joint_position, joint_velocity, joint_stiffness"
             self._refuse(t, f"{names}: {sorted(counts)} values, expected {self.model.joints} each")
-            return
-        motion = (setpoint.p_WD, setpoint.V_WD, setpoint.F_W, setpoint.stiffness, setpoint.damping_ratio)
-        if not np.isfinite(np.concatenate((*motion, setpoint.q, setpoint.qd, setpoint.joint_stiffness))).all():
-            self._refuse(t, "has values that are not finite")
             return
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS

@@ -149,10 +149,6 @@ class SupervisorService(Service):
         measured = Measurement(
             np.array(status.position), np.array(status.velocity), wrench(status.wrench), np.array(status.measured_torque)
         )
-        for name, value in measured._asdict().items():
-            if not np.isfinite(value).all():
-                reason = f"robot/status: {name} = {value}: must be finite"
-                return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS

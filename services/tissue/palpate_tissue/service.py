@@ -130,11 +130,8 @@ class TissueService(Service):
         for at, place in self._path(t, nanoseconds(tool.header.stamp), p_A):
             force_A, torque_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
             self._t, self._p_A = at, place
-        F_A = np.array((force_A, torque_A))
-        if not F_A.any():  # a zero without a sign
-            return np.zeros(6)
-        F_W: Array = F_A.dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
-        return F_W
+        F_W: Array = np.array((force_A, torque_A)).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
+        return F_W + 0.0  # a zero without a sign
 
     def _path(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:
         """Return times [ns] and positions [m] of the steps to `t` [ns], given the tool at `stamp`; one step if nothing is late.
