@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
-from math import acos, hypot, inf
+from math import acos, dist, hypot, inf
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -132,8 +132,6 @@ def _too_fast(message: Message, before: Message, path: str, max_change: float) -
 
 FEW = 32
 """Up to this number of values a loop in Python is faster than numpy."""
-LARGE = 1e9
-"""Larger limits are not compared with a sum of squares, which could overflow."""
 _NO_PAST = PastMessages([])
 
 
@@ -262,8 +260,8 @@ def compile_check(row: str, sends: bool, alone: bool = False) -> Callable[[Messa
     text = "\n".join(
         ("def conforms(m, past, t):", " try:", *(f"  {line}" for line in body), " except Exception: return False", " return True")
     )
-    functions = {"Array": np.ndarray, "array": np.asarray, "equal": np.array_equal, "repeats": repeats, "turn": turn}
-    names: dict[str, Any] = {**functions, "Type": message_type(topic.type), "frame": topic.frame}
+    functions = {"array": np.asarray, "equal": np.array_equal, "repeats": repeats, "turn": turn, "hypot": hypot, "dist": dist}
+    names: dict[str, Any] = {**functions, "Array": np.ndarray, "Type": message_type(topic.type), "frame": topic.frame}
     exec(compile(text, f"<check of {topic.name}>", "exec"), names)
     check: Callable[[Message, PastMessages, int], bool] = names["conforms"]
     return check
@@ -315,13 +313,12 @@ class _Source:
                 yield f"if not turn(m.{path}, before.{path}) <= max_change: return False"
                 continue
             for leaf in leaves(self._topic.type, path):
-                yield f"change = m.{leaf.path} - before.{leaf.path}"
                 if leaf.array:
-                    yield "if not change.dot(change) <= max_change * max_change:"
-                    yield " for one in change.tolist():"
+                    yield f"if not dist(m.{leaf.path}.tolist(), before.{leaf.path}.tolist()) <= max_change:"
+                    yield f" for one in (m.{leaf.path} - before.{leaf.path}).tolist():"
                     yield "  if not -max_change <= one <= max_change: return False"
                 else:
-                    yield "if not -max_change <= change <= max_change: return False"
+                    yield f"if not -max_change <= m.{leaf.path} - before.{leaf.path} <= max_change: return False"
 
     def _varies(self) -> Iterator[str]:
         """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
@@ -381,8 +378,8 @@ class _Source:
         yield f"if {inner}.size > {FEW}:"
         yield f" if not ({low!r} <= {inner}.min() and {inner}.max() <= {high!r}): return False"
         radius = min(-low, high)
-        if detail[0].startswith("float") and 0 < radius < LARGE:  # no number is larger than the root of the sum of squares
-            yield f"elif not {inner}.dot({inner}) <= {radius * radius!r}:"
+        if detail[0].startswith("float") and radius > 0:  # no number is larger than the root of the sum of squares
+            yield f"elif not hypot(*{inner}.tolist()) <= {radius!r}:"
         else:
             yield "else:"
         yield f" for one in {inner}.tolist():"
