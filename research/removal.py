@@ -1,8 +1,8 @@
-"""Gain of each compiled module and each codec: `python -m research.removal` prints a table.
+"""Gain of each compiled module, of the encoders, and cost of the checks: `python -m research.removal` prints a table.
 
 Whole composed examinations are run. Of their slots of 100 simulated ms, which contain every period but the slowest, every other
 one has one thing taken away, in turn: the compiled functions of a module run as the numpy or Python that they are written in, or
-rosbags encodes and decodes a message type. Each slot is compared with the mean of the two around it, by the processor's time of
+rosbags encodes and decodes the messages. Each slot is compared with the mean of the two around it, by the processor's time of
 the thread, so neither the phase of the examination nor other work on the machine counts.
 """
 
@@ -22,7 +22,6 @@ from rich.table import Table
 
 from palpate.run.composed import load_services
 from palpate.run.roles import WORKERS
-from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import MS
 from palpate_bus.runtime.composed import Composed
@@ -66,25 +65,42 @@ def _interpret(modules: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _by_rosbags(run: Composed, kind: str) -> Iterator[None]:
-    """Encode and decodes the messages of one type with rosbags."""
-    ports = [port for stepper in run.steppers.values() for port in stepper.ports.values() if port.topic.type == kind]
-    buffers = [buffer for stepper in run.steppers.values() for buffer in stepper.buffers.values() if buffer.topic.type == kind]
+def _by_rosbags(run: Composed) -> Iterator[None]:
+    """Encode and decode messages with rosbags."""
+    ports = [port for stepper in run.steppers.values() for port in stepper.ports.values()]
+    buffers = [buffer for stepper in run.steppers.values() for buffer in stepper.buffers.values()]
     for port in ports:
-        port.encode = lambda message: bytes(codec.store.serialize_cdr(message, kind))
+        port.encode = partial(_serialize, port.topic.type)
     for buffer in buffers:
-        buffer.decode = lambda payload: codec.store.deserialize_cdr(payload, kind)
+        buffer.decode = partial(_deserialize, buffer.topic.type)
     try:
         yield
     finally:
         for port in ports:
-            port.encode = codec.encoder(kind)
+            port.encode = codec.encoder(port.topic.type)
         for buffer in buffers:
-            buffer.decode = codec.decoder(kind)
+            buffer.decode = codec.decoder(buffer.topic.type)
 
 
-FAST_TYPES = sorted({topic.type for topic in contract().topics.values() if topic.period_ms == 1})
-"""Types of the 1 kHz topics."""
+def _serialize(name: str, message: codec.Message) -> bytes:
+    return bytes(codec.store.serialize_cdr(message, name))
+
+
+def _deserialize(name: str, payload: bytes | memoryview) -> codec.Message:
+    return codec.store.deserialize_cdr(payload, name)
+
+
+@contextmanager
+def _unchecked(run: Composed) -> Iterator[None]:
+    """Send messages without a check."""
+    checks = [(port.check, port.check.conforms) for stepper in run.steppers.values() for port in stepper.ports.values()]
+    for check, _ in checks:
+        check.conforms = lambda *_: True
+    try:
+        yield
+    finally:
+        for check, conforms in checks:
+            check.conforms = conforms
 
 
 def measure(scenario: Scenario) -> dict[str, list[float]]:
@@ -92,7 +108,7 @@ def measure(scenario: Scenario) -> dict[str, list[float]]:
     tree = FrameTree(exam_input(scenario))
     run = Composed([*load_services(scenario, WORKERS), collector := Collector(tree=tree)])
     removals: dict[str, Callable[[], Any]] = {name: partial(_interpret, modules) for name, modules in MODULES.items()}
-    removals |= {kind: partial(_by_rosbags, run, kind) for kind in FAST_TYPES}
+    removals |= {"encoders and decoders": partial(_by_rosbags, run), "checks of messages": partial(_unchecked, run)}
     run.start()
 
     def slot() -> float:

@@ -237,7 +237,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence number and the digest over all messages sent."""
 
-    __slots__ = ("_check", "_digest", "_unchained", "encode", "event", "here", "latched", "passed", "period", "sequence", "topic")
+    __slots__ = ("_digest", "_unchained", "check", "encode", "event", "here", "latched", "passed", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -245,7 +245,7 @@ class OutputPort:
         self.event = topic.event
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
-        self._check = PortCheck(topic, sends=True)
+        self.check = PortCheck(topic, sends=True)
         self.passed: Callable[[Message], Message | None] | None = None
         """Makes the message for readers in this process."""
         self.here = False
@@ -257,7 +257,7 @@ class OutputPort:
 
     def pack(self, message: Message, t: int) -> Outgoing:
         """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
-        check = self._check
+        check = self.check
         if not check.conforms(message, check.past, t):
             raise check.refusal(message, t)
         sequence = self.sequence = self.sequence + 1
