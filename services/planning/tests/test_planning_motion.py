@@ -1,6 +1,7 @@
 """Tests of kinematics, collision scene, free motion and timing."""
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models.numerics.frames import rigid
 from palpate_models.robot import lbr
+from palpate_models.scenario.arm_file import arm_path
 from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
@@ -189,3 +191,13 @@ def test_scan_postures_leave_the_view_free_and_differ() -> None:
     assert len(postures) >= 3
     assert np.array_equal(postures[0], lbr.HOME)
     assert all(np.abs(a - b).max() > 0.5 for i, a in enumerate(postures) for b in postures[:i])
+
+
+def test_scan_postures_are_within_the_limits_of_the_first_joint(tmp_path: Path) -> None:
+    file = tmp_path / "narrow.yaml"
+    narrow = "lower_rad: [-2.9, -1.7, -2.9, -3.1, -2.9, 0.0, -2.9]\nupper_rad: [1.0, 1.7, 2.9, 0.0, 2.9, 3.7, 2.9]\n"
+    file.write_text(arm_path("panda").read_text() + narrow)
+    turns = [float(q[0]) for q in look_postures(known(Robot(arm=str(file))))]
+    assert 0.0 in turns
+    assert -1.2 in turns
+    assert max(turns) < 1.0

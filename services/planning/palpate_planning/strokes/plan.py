@@ -152,7 +152,8 @@ class ExamPlanner:
 def look_postures(known: ExamInput) -> list[Array]:
     """Return collision-free postures to look from [rad], shape (n,) each: those that leave the view free first, by their turn.
 
-    They are the home posture, turned about the vertical.
+    They are the home posture, and it turned by the first joint within its limits: the arm cannot follow a set-point beyond
+    them, and jumps once the motion from there comes back within them.
     """
     kinematics = ArmKinematics(known.robot, known.limits)
     size = (known.exam.region_m[0] + 2 * SCAN.view_margin_m, known.exam.region_m[1] + 2 * SCAN.view_margin_m)
@@ -163,6 +164,7 @@ def look_postures(known: ExamInput) -> list[Array]:
     for turn in SCAN.turns_rad:
         q = kinematics.arm.home_rad.copy()
         q[0] += turn
-        if scene.free(q):
+        within = not turn or kinematics.lower[0] <= q[0] <= kinematics.upper[0]
+        if within and scene.free(q):
             postures.append(q)
     return sorted(postures, key=lambda q: not view.clear(q))
