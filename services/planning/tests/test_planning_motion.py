@@ -15,7 +15,7 @@ from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene
-from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, round_corners
+from palpate_planning.motion.timing import TIMING, JerkLimitedAxis, SpeedLimit, joint_trajectory, round_corners
 from palpate_planning.strokes.path import centre, least_twist
 from palpate_planning.strokes.plan import ExamPlanner, look_postures
 from palpate_planning.strokes.segments import REACH, STRETCHED
@@ -144,6 +144,20 @@ def test_paths_keep_the_elbow_bent(monkeypatch: pytest.MonkeyPatch) -> None:
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME), bend=bend)
     assert STRETCHED in examination.skipped.values()
     assert min(np.abs(segment.path.q[:, 3]).min() for segment in examination.segments if segment.free is None) > 0.98 * bend
+
+
+def test_a_weak_arm_moves_within_its_torques(tmp_path: Path) -> None:
+    file = tmp_path / "weak.yaml"
+    file.write_text(arm_path("ur5").read_text() + "torque_nm: [4.0, 52.0, 30.0, 6.0, 3.0, 2.0]\n")
+    durations = []
+    for name in ("ur5", str(file)):
+        kinematics = ArmKinematics(Robot(arm=name), LIMITS)
+        home = kinematics.arm.home_rad
+        trajectory = joint_trajectory(kinematics, np.array([home, home + np.array([1.0, 0, 0, 0, 0, 0])]), LIMITS, PERIOD_S)
+        accelerations = np.gradient(trajectory.qd, PERIOD_S, axis=0)
+        assert kinematics.torque_share(trajectory.q, trajectory.qd, accelerations) <= TIMING.torque_share
+        durations.append(len(trajectory))
+    assert durations[1] > 1.2 * durations[0]
 
 
 def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:

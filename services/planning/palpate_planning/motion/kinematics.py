@@ -77,6 +77,13 @@ class ArmKinematics:
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
+    def torque_share(self, q: Array, qd: Array, qdd: Array) -> float:
+        """Return the largest share of a joint's torque limit in a motion: positions, speeds, accelerations, shapes (m, n)."""
+        model, data, limit = self.model, self.data, self.arm.torque_nm
+        torque = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd, strict=True)])
+        friction = model.damping * np.abs(qd) + model.upperDryFrictionLimit * (np.abs(qd) > 0)
+        return float(((np.abs(torque) + friction) / limit).max())
+
     def solve(self, X_WI: Array, q_near: Array) -> IkSolution:
         """Return joint positions near `q_near` [rad], shape (n,), that put the indenter at X_WI.
 

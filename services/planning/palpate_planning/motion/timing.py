@@ -25,6 +25,12 @@ class TimingTuning(NamedTuple):
     """Time without a set-point after which control has stopped the arm (`ReferenceTuning.bridged_periods`)."""
     restart_ns: int = 300 * MS
     """Time in which an interrupted motion returns to its speed (assumed)."""
+    torque_share: float = 0.9
+    """Maximum torque of a motion over a joint's limit, with gravity; the rest is for errors of the model."""
+    torque_added: float = 0.05
+    """What a motion may add where gravity alone takes more."""
+    paces: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
+    """Factors on the speed of a motion, tried in order until the torques suffice; the last one is taken in any case."""
 
 
 TIMING: Final = TimingTuning()
@@ -158,11 +164,11 @@ def round_corners(points: Array, blend: float) -> Array:
 
 
 def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, period_s: float) -> JointTrajectory:
-    """Time a joint-space polyline, shape (k, n), within joint speed, joint acceleration and tool speed limits.
+    """Time a joint-space polyline, shape (k, n), within limits of joint speed, acceleration and torque, and of tool speed.
 
     The path is q(s) with s its length; s(t) comes from ruckig with a speed limit per position:
     |q'| v <= joint_velocity_scale * limit, |J q'| v <= speed_mps, |q''| v^2 <= half of the acceleration limit; the other
-    half is left to |q'| dv/dt.
+    half is left to |q'| dv/dt. A motion that needs more than `TIMING.torque_share` of a joint's torque is slowed down.
     """
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     points = points[np.concatenate(([True], lengths > 1e-9))]
@@ -182,8 +188,21 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     )
     speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
     acceleration = float((0.5 * kinematics.arm.acceleration_radps2 / np.maximum(np.abs(tangent), 1e-9)).min())
+    jerk, still = acceleration / TIMING.rise_s, np.zeros_like(q)
+    most = max(TIMING.torque_share, kinematics.torque_share(q, still, still) + TIMING.torque_added)
+    for pace in TIMING.paces:
+        trajectory = _timed(s, q, tangent, (pace * speed, pace**2 * acceleration, pace**3 * jerk), period_s)
+        accelerations = np.gradient(trajectory.qd, period_s, axis=0)
+        if kinematics.torque_share(trajectory.q, trajectory.qd, accelerations) <= most:
+            break
+    return trajectory
+
+
+def _timed(s: Array, q: Array, tangent: Array, limits: tuple[Array, float, float], period_s: float) -> JointTrajectory:
+    """Time a path q(s) by a speed at each s, an acceleration and a jerk of s."""
+    speed, acceleration, jerk = limits
     limit = SpeedLimit(s, speed, 0.7 * acceleration)
-    axis = JerkLimitedAxis(0.0, acceleration, acceleration / TIMING.rise_s, period_s)
+    axis = JerkLimitedAxis(0.0, acceleration, jerk, period_s)
     positions, rates = [0.0], [0.0]
     while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * period_s)):
         positions.append(axis.position)
@@ -191,6 +210,6 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     positions.append(float(s[-1]))
     rates.append(0.0)
     along, rate = np.array(positions), np.array(rates)
-    Q = np.column_stack([np.interp(along, s, q[:, i]) for i in range(points.shape[1])])
-    T = np.column_stack([np.interp(along, s, tangent[:, i]) for i in range(points.shape[1])])
+    Q = np.column_stack([np.interp(along, s, column) for column in q.T])
+    T = np.column_stack([np.interp(along, s, column) for column in tangent.T])
     return JointTrajectory(Q, T * rate[:, None])
