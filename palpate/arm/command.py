@@ -11,7 +11,8 @@ from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 if TYPE_CHECKING:
     from palpate_models.numerics.frames import Array
-    from palpate_models.scenario.schema import Scenario
+    from palpate_models.robot.chain import Arm
+    from palpate_models.scenario.schema import Robot, Scenario
 
 app = typer.Typer(name="arm", help="Check an arm, and find a place for its base.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next to a URDF.")]
@@ -27,10 +28,10 @@ def check(arm: Name) -> None:
     from palpate_models.robot.arm import check_arm
 
     found, faults = check_arm(arm)
-    if found is not None and (pairs := _touching(arm)):
-        advice = "is the flange in front of the arm, with z out of it? A shape is one capsule about a link's meshes: a link "
-        advice += "further out as the flange helps"
-        found, faults = None, [f"home_rad: {pair} touch: {advice}" for pair in pairs]
+    if found is not None and (pairs := _touching(arm, found.home_rad)):
+        origin = f" ({sought})" if (sought := _sought(arm)) else ""
+        faults = [f"home_rad: at {found.home_rad.tolist()}{origin} {'; '.join(pairs)} touch: {_advice(arm)}"]
+        found = None
     for fault in faults:
         say(f"{arm}: {fault}")
     if found is None:
@@ -46,6 +47,10 @@ def check(arm: Name) -> None:
     shapes = sum(map(len, found.capsules))
     mass = sum(inertia.mass for inertia in found.inertias[1:])
     parts = f"flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} collision shapes"
+    if sought := _sought(arm):
+        console.print(f"home_rad: {found.home_rad.tolist()}  # {sought}: add this line to keep it, or change it", soft_wrap=True)
+    if wrong := _turned(arm, found):
+        console.print(wrong, soft_wrap=True)
     console.print(f"usable: {found.joints} joints, {mass:.1f} kg without its base, {parts}", soft_wrap=True)
 
 
@@ -82,21 +87,60 @@ def place(
     _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
     at = chosen.model_copy(update={"robot": robot})
     if not look_postures(exam_input(at)):
-        say("no posture to look from is free of collisions here: give another home_rad, or move the base by hand")
+        say(f"{arm}: home_rad: no posture to look from is free of collisions here: {_advice(arm, robot)}")
     console.print(f"drawn in {out}", soft_wrap=True)
 
 
-def _touching(arm: str) -> list[str]:
-    """Return the pairs of shapes of an arm, tool included, that are too close at home, wherever its base stands."""
+def _sought(arm: str) -> str:
+    """Return a text on a home posture that the arm's file does not have; empty if it has one."""
+    from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file, arm_path
+
+    missing = arm != DEFAULT_ARM and arm_file(arm).home_rad is None
+    return f"sought, as {arm_path(arm).name} has none" if missing else ""
+
+
+def _turned(arm: str, found: Arm) -> str:
+    """Return what to write if the flange's z does not point out of the arm; empty if it does."""
+    from palpate_models.robot.urdf_arm import flange_advice
+    from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file, arm_path
+
+    if arm == DEFAULT_ARM:
+        return ""
+    return flange_advice(found, arm_file(arm)).replace("the YAML file", arm_path(arm).name)
+
+
+def _advice(arm: str, robot: Robot | None = None) -> str:
+    """Return what to write where an arm touches itself at home, or the surroundings of `robot`."""
     from palpate_models.robot.arm import arm_of
+    from palpate_models.robot.fitting import ready_postures
+    from palpate_models.robot.urdf_arm import home_advice
+    from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file, arm_path
+    from palpate_models.scenario.schema import Robot
+
+    found = arm_of(robot or Robot(arm=arm))
+    if arm == DEFAULT_ARM:
+        return "move the base by hand"
+    if wrong := _turned(arm, found):
+        return wrong
+    for home in ready_postures(found):
+        if not _touching(arm, home, robot):
+            return f"write `home_rad: {home.tolist()}` in {arm_path(arm).name}, which is clear"
+    return home_advice(found, arm_file(arm)).replace("the YAML file", arm_path(arm).name)
+
+
+def _touching(arm: str, home: Array, at: Robot | None = None) -> list[str]:
+    """Return the pairs of shapes of an arm, tool included, that are too close at `home` [rad], wherever its base stands.
+
+    With `at`, also those of the arm and the table or base there.
+    """
     from palpate_models.robot.table import boxes
     from palpate_models.scenario.schema import Limits, Robot
     from palpate_planning.motion.kinematics import ArmKinematics
     from palpate_planning.motion.scene import CollisionScene
 
-    robot = Robot(arm=arm)
-    found = CollisionScene(ArmKinematics(robot, Limits()), robot).collisions(arm_of(robot).home_rad)
-    return [pair for pair in found if not any(pair.endswith(box.name) for box in boxes(robot))]
+    robot = at or Robot(arm=arm)
+    found = CollisionScene(ArmKinematics(robot, Limits()), robot).collisions(home)
+    return [pair for pair in found if at is not None or not any(pair.endswith(box.name) for box in boxes(robot))]
 
 
 def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:

@@ -37,7 +37,7 @@ class PlacementTuning(NamedTuple):
 
 PLACEMENT: Final = PlacementTuning()
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
-"""Minimum and maximum x, y and height [m] and yaw [rad] of the base."""
+"""Minimum and maximum x, y and height [m] and yaw [rad] of the base; yaw as far from the robot's own where that is beyond."""
 STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))
 """Placements to start from, after the robot's own; the best result counts, as the problem is not convex."""
 
@@ -99,7 +99,9 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
     base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", model.joints, count), ca.MX.sym("worst")
     bases = ca.repmat(base, 1, count)
     costs = functions.cost.map(count)(Q, bases, POSTURES.pressing_force_n)[0]
-    objective = worst + PLACEMENT.mean_weight * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
+    turn = start[3] if abs(start[3]) > BOUNDS[1][3] else 0.0  # the user's own: not every arm faces its base's x
+    sides = [bound + np.array((0.0, 0.0, 0.0, turn)) for bound in BOUNDS]
+    objective = worst + PLACEMENT.mean_weight * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3] - turn))
     first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), POSTURES.pressing_force_n)[0]
     residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
     corner = base[0] + BASE_SIDE_M / 2 * (ca.cos(base[3]) + ca.sqrt(ca.sin(base[3]) ** 2 + 1e-6))
@@ -111,8 +113,8 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
     zeros = np.zeros(5 * count)
     result = solver(
         x0=np.concatenate((start, guess.ravel(), [float(np.array(first).max())])),
-        lbx=np.concatenate((BOUNDS[0], lower, [-np.inf])),
-        ubx=np.concatenate((BOUNDS[1], upper, [np.inf])),
+        lbx=np.concatenate((sides[0], lower, [-np.inf])),
+        ubx=np.concatenate((sides[1], upper, [np.inf])),
         lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
         ubg=np.concatenate((zeros, [TABLE.x_m[0] - PLACEMENT.clearance_m], np.zeros(count))),
     )

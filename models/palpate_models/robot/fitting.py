@@ -24,30 +24,36 @@ class HomeTuning(NamedTuple):
     """Highest cost above the best one at which a posture is considered; of these, the one with the highest elbow is taken."""
     upright: float = 0.999
     """Minimum cosine between the flange's z axis and straight down at home."""
+    weights: tuple[float, float] = (1.0, 10.0)
+    """Weights of the flange's direction over its place, tried in order until a posture is found."""
 
 
 HOME: Final = HomeTuning()
 
 
-def ready_posture(arm: Arm) -> Array | None:
-    """Return joint positions [rad], shape (n,), with the flange straight down above the base's front; None if none is found."""
+def ready_postures(arm: Arm) -> list[Array]:
+    """Return joint positions [rad], shape (n,), with the flange straight down above the base's front, the best ones first."""
     rng = np.random.default_rng(0)
     near, half = arm.middle_rad, np.minimum(arm.half_range_rad, np.pi)
     starts = near + rng.uniform(-1, 1, (HOME.starts, arm.joints)) * np.minimum(half, 1.6)
     reach = float(np.linalg.norm(np.diff(arm.posture(near)[0], axis=0), axis=1).sum())
     aim = reach * np.array((HOME.forward, 0.0, HOME.height))
 
-    def gap(q: Array) -> Array:
+    def gap(q: Array, weight: float) -> Array:
         p, z = arm.posture(q)
-        return np.concatenate(((p[-1] - aim) / reach, z - (0.0, 0.0, -1.0), HOME.bend * (q - near) / np.pi))
+        return np.concatenate(((p[-1] - aim) / reach, weight * (z - (0.0, 0.0, -1.0)), HOME.bend * (q - near) / np.pi))
 
     margin = 0.1 * half
     bounds = (np.maximum(arm.lower_rad, near - np.pi) + margin, np.minimum(arm.upper_rad, near + np.pi) - margin)
-    found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds) for start in starts]
+    for weight in HOME.weights:
+        found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds, args=(weight,)) for start in starts]
+        upright = [one for one in found if arm.posture(one.x)[1][2] < -HOME.upright]
+        if upright:
+            break
     lowest = min(float(one.cost) for one in found)
-    good = [one.x for one in found if one.cost < lowest + HOME.spread and arm.posture(one.x)[1][2] < -HOME.upright]
-    highest = max(good, key=lambda q: float(arm.posture(q)[0][arm.elbow[0], 2]), default=None)
-    return None if highest is None else np.round(highest, 3)
+    elbow = arm.elbow[0]
+    order = sorted(upright, key=lambda one: (one.cost >= lowest + HOME.spread, -float(arm.posture(one.x)[0][elbow, 2])))
+    return [np.round(one.x, 3) for one in order]
 
 
 def enclosing_capsule(points: Array) -> Capsule:

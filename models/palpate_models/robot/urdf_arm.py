@@ -4,6 +4,7 @@
 """
 
 import sys
+import warnings
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm, Capsule, Inertia
-from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_posture
+from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_postures
 from palpate_models.robot.urdf_tree import UrdfTree, link_name
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 from palpate_models.scenario.schema import Limits
@@ -39,6 +40,8 @@ class ArmTuning(NamedTuple):
     largest_link_m: float = 2.0
     """A larger mesh is in other units."""
     smallest_link_m: float = 0.005
+    mount_m: float = 0.01
+    """A flange nearer to the last joint does not show where the arm points."""
     inertia_tolerance: float = 1e-3
     """Relative excess of a principal moment over the sum of the others that counts as rounding."""
 
@@ -60,6 +63,26 @@ def read_arm(name: str) -> tuple[Arm | None, list[str]]:
     """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
     given, path = arm_file(name), arm_path(name)
     return _Reader(given, _resolve(given.urdf, path.parent)).read(path.stem)
+
+
+def flange_advice(arm: Arm, given: ArmFile) -> str:
+    """Return which turn of the flange to write if its z does not point out of the arm; empty if it does, or cannot be seen."""
+    p, R = arm.flange_m, Rotation.from_euler("xyz", given.flange_rpy_rad)
+    axis = int(np.argmax(np.abs(p)))
+    if np.linalg.norm(p) < TUNING.mount_m or (axis, p[axis] > 0) == (2, True):
+        return ""
+    out = np.sign(p[axis]) * np.eye(3)[axis]
+    turn = Rotation.from_rotvec((np.pi, 0, 0) if axis == 2 else np.cross((0, 0, np.pi / 2), out))
+    with warnings.catch_warnings(action="ignore"):  # a gimbal lock, where the angles are still right
+        rpy = np.round((R * turn).as_euler("xyz"), 4) + 0.0
+    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in the YAML file"
+
+
+def home_advice(arm: Arm, given: ArmFile) -> str:
+    """Return which field to write with which value, where an arm's home posture is missing or unusable."""
+    angles = ", ".join(arm.joint_names)
+    other = f"write `home_rad: [...]` in the YAML file: [rad] of {angles} with the tool straight down, clear of the arm"
+    return flange_advice(arm, given) or other
 
 
 def _resolve(name: str, folder: Path) -> Path:
@@ -161,12 +184,13 @@ class _Reader(UrdfTree):
             R_BL=R_BF,
         )
         if given.home_rad is None and not self.faults:
-            found = ready_posture(arm)
-            if found is None:
-                text = "no posture with z of the flange straight down was found; turn its axes by flange_rpy_rad, or give one"
-                self.faults.append(f"home_rad: {text}")
+            found = ready_postures(arm)
+            if found:
+                arm = replace(arm, home_rad=found[0])
             else:
-                arm = replace(arm, home_rad=found)
+                self.faults.append(
+                    f"home_rad: no posture with z of {given.flange} straight down was found: {home_advice(arm, given)}"
+                )
         return (None if self.faults else arm), self.faults
 
     def _axis(self, joint: ElementTree.Element) -> Array:

@@ -23,7 +23,8 @@ class CollisionTuning(NamedTuple):
     step_rad: float = 0.02
     """Maximum joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
     links_apart: int = 3
-    """Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits."""
+    """Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits. The
+    flange's shape, the F/T sensor, is part of the last link. Stand-off and sphere reach further: each counts as a joint."""
 
 
 COLLISION = CollisionTuning()
@@ -93,14 +94,18 @@ class CollisionScene:
         self._data = self._model.createData()
         self._geometry = pin.GeometryModel()
         links, shapes = link_names(robot), _arm_shapes(self._model, robot)
-        arm = [(link, self._add(f"{link}_{k}", joint, pose, shape)) for k, (link, joint, pose, shape) in enumerate(shapes)]
+        place = {link: k for k, link in enumerate(links)}
+        place[kinematics.arm.link_names[-1]] -= 1
+        self._names: list[str] = []
+        """Link or box of each shape."""
+        arm = [(link, self._add(link, joint, pose, shape)) for link, joint, pose, shape in shapes]
         obstacles = [(box.name, self._add(box.name, 0, pin.SE3(box.X_WB), coal.Box(*box.size))) for box in table.boxes(robot)]
         if abdomen is not None:
             vertices, triangles = with_skirt(*abdomen, table.TABLE.top_m)
             obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
         for k, (link, shape) in enumerate(arm):
             for other, other_shape in arm[:k]:
-                if links.index(link) - links.index(other) >= COLLISION.links_apart:
+                if place[link] - place[other] >= COLLISION.links_apart:
                     self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
             for name, obstacle in obstacles:
                 at_base = link == links[0] or (name == "robot_base" and links.index(link) < count_mounted(robot))
@@ -111,21 +116,21 @@ class CollisionScene:
             request.security_margin = COLLISION.margin_m
 
     def _add(self, name: str, joint: int, placement: pin.SE3, geometry: coal.CollisionGeometry) -> int:
-        return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))
+        self._names.append(name)
+        return int(self._geometry.addGeometryObject(pin.GeometryObject(f"{name} {len(self._names)}", joint, placement, geometry)))
 
     def free(self, q: Array) -> bool:
         """Return True if the arm at q [rad] keeps its margin to all obstacles and to itself."""
         return not pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, True)
 
     def collisions(self, q: Array) -> list[str]:
-        """Return the names of pairs closer than the margin at q, for messages."""
+        """Return the pairs of links or boxes closer than the margin at q, each once, for messages."""
         pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, False)
         found = []
         for pair, result in zip(self._geometry.collisionPairs, self._results.collisionResults, strict=True):
             if result.isCollision():
-                names = (self._geometry.geometryObjects[i].name for i in (pair.first, pair.second))
-                found.append(" and ".join(names))
-        return found
+                found.append(" and ".join(self._names[i] for i in (pair.first, pair.second)))
+        return list(dict.fromkeys(found))
 
     def motion_free(self, q0: Array, q1: Array) -> bool:
         """True if the straight joint-space motion from q0 to q1 is free, checked every `COLLISION.step_rad` with both ends."""

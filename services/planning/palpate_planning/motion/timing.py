@@ -28,7 +28,7 @@ class TimingTuning(NamedTuple):
     torque_share: float = 0.9
     """Maximum torque of a motion over a joint's limit, with gravity; the rest is for errors of the model."""
     torque_added: float = 0.05
-    """What a motion may add where gravity alone takes more."""
+    """Share that a motion may add where gravity alone takes more."""
     paces: tuple[float, ...] = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
     """Factors on the speed of a motion, tried in order until the torques suffice; the last one is taken in any case."""
 
