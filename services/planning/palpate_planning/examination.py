@@ -182,7 +182,7 @@ class ExaminationSequence:
     def _look(self, now: Observation, out: ExamStep) -> None:
         course, views, frames = self._course, self._views, self._known.camera.frames
         if not views.postures:
-            text = "every look posture collides: check robot.base_xy_m, base_yaw_rad and base_height_m"
+            text = "every look posture collides: check robot.base_xy_m, base_yaw_rad, base_height_m, and home_rad of robot.arm"
             course.abort(now, Cause(Reason.VIEW_UNREACHABLE, text))
         elif views.asked is None:
             try:
