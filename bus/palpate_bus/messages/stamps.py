@@ -33,7 +33,7 @@ def header(t: int, frame_id: str = "") -> Header:
 
 def nanoseconds(time_or_duration: Time | Duration) -> int:
     """Return a `Time` or `Duration` in nanoseconds."""
-    return time_or_duration.sec * NS + time_or_duration.nanosec
+    return int(time_or_duration.sec) * NS + int(time_or_duration.nanosec)
 
 
 def blank(name: str, t: int = 0, frame: str = "") -> Any:
