@@ -24,7 +24,7 @@ GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: Any) -> str:
     """Return the YAML file of an arm of six joints; `changes` replace parts of its third joint and link, or of the YAML file."""
     given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
-        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "base_heigth_m")
+        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "base", "base_heigth_m")
     }
     links = ['<link name="link_0"/>']
     for k, rpy in enumerate(TWISTS, start=1):
@@ -128,6 +128,8 @@ BROKEN = {
         {"collision": '<geometry><mesh filename="arm.urdf"/></geometry>'},
         "link link_3: mesh arm.urdf cannot be read",
     ),
+    "no base": ({"base": "gripper"}, "base: no link 'gripper' before tip; it has link_0, link_1"),
+    "base too far": ({"base": "link_1"}, "5 joints from link_1 to tip, expected 6 or 7 that turn; where the arm is part"),
     "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, expected 6"),
 }
 
@@ -185,6 +187,23 @@ def test_a_urdf_in_place_of_its_yaml_file_is_named(tmp_path: Path) -> None:
     write(tmp_path)
     with pytest.raises(UserError, match=r"arm\.urdf: is a URDF; expected the path of a YAML file .*`urdf: arm.urdf` and `flange"):
         read_arm(str(tmp_path / "arm.urdf"))
+
+
+def test_an_arm_of_a_larger_robot_begins_at_its_base(tmp_path: Path) -> None:
+    """A lift before its base and the mount of a second arm are left out."""
+    lift = '<joint name="lift" type="prismatic"><parent link="trunk"/><child link="link_0"/></joint>'
+    mount = '<joint name="other" type="fixed"><parent link="trunk"/><child link="mount"/></joint>'
+    body = f'<link name="trunk">{INERTIAL.format(**GOOD)}</link><link name="mount"/>{lift}{mount}'
+    swap = {"swap": ("</robot>", f"{body}</robot>")}
+    for folder in ("alone", "part", "whole"):
+        (tmp_path / folder).mkdir()
+    alone, _ = read_arm(write(tmp_path / "alone"))
+    part, faults = read_arm(write(tmp_path / "part", base="link_0", **swap))
+    assert alone is not None
+    assert part is not None, faults
+    assert (part.link_names, part.inertias) == (alone.link_names, alone.inertias)
+    np.testing.assert_array_equal(part.origin_m, alone.origin_m)
+    assert "write `base: LINK`" in read_arm(write(tmp_path / "whole", **swap))[1][0]
 
 
 def test_a_home_posture_is_found(tmp_path: Path) -> None:

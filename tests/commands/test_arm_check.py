@@ -48,6 +48,14 @@ def test_a_wide_forearm_does_not_cover_the_flange(tmp_path: Path, home: str) -> 
     assert code == 0, output
 
 
+def test_shapes_that_touch_in_every_posture_do_not_forbid_an_arm(tmp_path: Path) -> None:
+    """Cylinders that end at joints, each with another three joints away, become capsules that reach beyond them."""
+    baxter = "urdf: package://example-robot-data/robots/baxter_description/urdf/baxter.urdf\n"
+    code, output = check(tmp_path, f"{baxter}base: left_arm_mount\nflange: left_hand_link\n")
+    assert code == 0, output
+    assert "usable: 7 joints" in output
+
+
 def test_a_sought_home_posture_is_given_as_a_line_to_add(tmp_path: Path) -> None:
     code, output = check(tmp_path, EE)
     assert code == 0, output

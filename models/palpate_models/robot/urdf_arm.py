@@ -107,6 +107,7 @@ def _coal() -> Any:
 
 Group = list[tuple[str, Array]]
 """Links fixed to each other, with their pose in the root at zero."""
+_PART: Final = "where the arm is part of a larger robot, write `base: LINK` in the YAML file, the link where it begins"
 _MOMENTS: Final = ("xx", "yy", "zz", "xy", "xz", "yz")
 _LIMITS: Final[tuple[tuple[str, str, float | None], ...]] = (
     ("lower", "lower_rad", -TUNING.continuous_rad),
@@ -138,11 +139,16 @@ class _Reader(UrdfTree):
             near = get_close_matches(self._given.flange, self.links, 6, 0.4) or list(self.links)[-6:]
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
         chain = self.chain(self._given.flange)
+        if self._given.base is not None:
+            if self._given.base not in chain[:-1]:
+                between = f"it has {', '.join(chain[:-1])}"
+                return None, [f"base: no link {self._given.base!r} before {self._given.flange}; {between}"]
+            chain = chain[chain.index(self._given.base) :]
         self._base = chain[0]
         poses, moving = self._link_poses(chain)
         n = len(moving)
         if n not in (6, 7):
-            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, expected 6 or 7 that turn"]
+            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, expected 6 or 7 that turn; {_PART}"]
         lower, upper, velocity, torque = self._limits(moving)
         R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
@@ -217,7 +223,7 @@ class _Reader(UrdfTree):
             if kind in ("revolute", "continuous"):
                 moving.append(joint)
             elif kind != "fixed":
-                raise ValueError(f"{self.part}: is {kind}; expected joints that turn")
+                raise ValueError(f"{self.part}: is {kind}; expected joints that turn; {_PART}")
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> Array:

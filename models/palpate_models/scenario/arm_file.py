@@ -37,6 +37,8 @@ class ArmFile(Section):
     """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
     flange: str
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
+    base: str | None = None
+    """Link where the arm begins, if it is part of a larger robot; links before it and branches off it are left out."""
     flange_rpy_rad: Vec3 = (0.0, 0.0, 0.0)
     """Turn from the axes of that link to those of the flange, if its z is not out of the arm."""
     home_rad: Joints | None = None

@@ -1,6 +1,7 @@
 """The collision scene: the arm's capsules, table, base and the perceived abdomen, checked with coal through pinocchio."""
 
 from collections.abc import Iterator
+from functools import cache
 from typing import NamedTuple
 
 import coal
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import table
-from palpate_models.robot.arm import capsules, count_mounted, link_names
+from palpate_models.robot.arm import arm_of, capsules, count_mounted, link_names, urdf
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
@@ -25,6 +26,8 @@ class CollisionTuning(NamedTuple):
     links_apart: int = 3
     """Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits. The
     flange's shape, the F/T sensor, is part of the last link. Stand-off and sphere reach further: each counts as a joint."""
+    postures: int = 60
+    """Random postures. Links of the arm whose shapes touch at all of them are not checked: the shapes are too coarse."""
 
 
 COLLISION = CollisionTuning()
@@ -50,6 +53,29 @@ def _arm_shapes(model: pin.Model, robot: Robot) -> Iterator[tuple[str, int, pin.
             length = float(np.linalg.norm(end - start))
             shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
             yield link, frame.parentJoint, frame.placement * _alignment(start, end), shape
+
+
+@cache
+def _arm_pairs(robot: Robot) -> frozenset[tuple[int, int]]:
+    """Return the pairs of shapes of the arm that are checked against each other, as their places in `_arm_shapes`."""
+    arm, model, geometry = arm_of(robot), pin.buildModelFromXML(urdf(robot, geometry=False)), pin.GeometryModel()
+    place = {link: k for k, link in enumerate(link_names(robot))}
+    place[arm.link_names[-1]] -= 1
+    links = []
+    for k, (link, joint, pose, shape) in enumerate(_arm_shapes(model, robot)):
+        geometry.addGeometryObject(pin.GeometryObject(str(k), joint, pose, shape))
+        links.append(link)
+    pairs = [(j, k) for k, link in enumerate(links) for j in range(k) if place[link] - place[links[j]] >= COLLISION.links_apart]
+    for pair in pairs:
+        geometry.addCollisionPair(pin.CollisionPair(*pair))
+    data, results, touching = model.createData(), geometry.createData(), np.ones(len(pairs), dtype=bool)
+    for request in results.collisionRequests:
+        request.security_margin = COLLISION.margin_m
+    for q in np.random.default_rng(0).uniform(arm.lower_rad, arm.upper_rad, (COLLISION.postures, arm.joints)):
+        pin.computeCollisions(model, data, geometry, results, q, False)
+        touching &= np.array([result.isCollision() for result in results.collisionResults], dtype=bool)
+    tool = (arm.link_names[-1], *TOOL_LINKS)
+    return frozenset(pair for pair, always in zip(pairs, touching, strict=True) if not always or links[pair[1]] in tool)
 
 
 def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
@@ -93,9 +119,7 @@ class CollisionScene:
         self._model = kinematics.model
         self._data = self._model.createData()
         self._geometry = pin.GeometryModel()
-        links, shapes = link_names(robot), _arm_shapes(self._model, robot)
-        place = {link: k for k, link in enumerate(links)}
-        place[kinematics.arm.link_names[-1]] -= 1
+        links, shapes, checked = link_names(robot), _arm_shapes(self._model, robot), _arm_pairs(robot)
         self._names: list[str] = []
         """Link or box of each shape."""
         arm = [(link, self._add(link, joint, pose, shape)) for link, joint, pose, shape in shapes]
@@ -104,9 +128,9 @@ class CollisionScene:
             vertices, triangles = with_skirt(*abdomen, table.TABLE.top_m)
             obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
         for k, (link, shape) in enumerate(arm):
-            for other, other_shape in arm[:k]:
-                if place[link] - place[other] >= COLLISION.links_apart:
-                    self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
+            for j, (_, other) in enumerate(arm[:k]):
+                if (j, k) in checked:
+                    self._geometry.addCollisionPair(pin.CollisionPair(other, shape))
             for name, obstacle in obstacles:
                 at_base = link == links[0] or (name == "robot_base" and links.index(link) < count_mounted(robot))
                 if not at_base and not (name == "abdomen" and tool_may_touch and link in TOOL_LINKS):
