@@ -213,6 +213,15 @@ def test_a_home_posture_is_found(tmp_path: Path) -> None:
     assert ((arm.lower_rad < arm.home_rad) & (arm.home_rad < arm.upper_rad)).all()
 
 
+def test_inverse_kinematics_starts_from_several_postures(tmp_path: Path) -> None:
+    """From home alone TIAGo's arm reached 5 of 18 targets in a place where it reaches all."""
+    arm, faults = read_arm(write(tmp_path))
+    assert arm is not None, faults
+    assert arm.seeds_rad[0] == tuple(arm.home_rad)
+    assert len(arm.seeds_rad) > 1
+    assert read_arm("ur5")[0].seeds_rad == (tuple(read_arm("ur5")[0].home_rad),)  # type: ignore[union-attr]
+
+
 def test_a_capsule_encloses_its_points() -> None:
     rng = np.random.default_rng(1)
     for scale in rng.uniform(0.02, 0.5, (20, 3)):

@@ -40,6 +40,9 @@ class ArmTuning(NamedTuple):
     largest_link_m: float = 2.0
     """A larger mesh is in other units."""
     smallest_link_m: float = 0.005
+    seeds: int = 5
+    """Maximum number of postures from which inverse kinematics starts, home included."""
+    seed_rad: float = 0.3
     mount_m: float = 0.01
     """A flange nearer to the last joint does not show where the arm points."""
     inertia_tolerance: float = 1e-3
@@ -189,14 +192,14 @@ class _Reader(UrdfTree):
             seeds_rad=given.seeds_rad,
             R_BL=R_BF,
         )
-        if given.home_rad is None and not self.faults:
+        if not self.faults and not (given.home_rad and given.seeds_rad):
             found = ready_postures(arm)
-            if found:
+            if given.home_rad is None and found:
                 arm = replace(arm, home_rad=found[0])
-            else:
-                self.faults.append(
-                    f"home_rad: no posture with z of {given.flange} straight down was found: {home_advice(arm, given)}"
-                )
+            elif given.home_rad is None:
+                text = f"no posture with z of {given.flange} straight down was found"
+                self.faults.append(f"home_rad: {text}: {home_advice(arm, given)}")
+            arm = arm if given.seeds_rad else replace(arm, seeds_rad=_distinct([arm.home_rad, *found]))
         return (None if self.faults else arm), self.faults
 
     def _axis(self, joint: ElementTree.Element) -> Array:
@@ -379,6 +382,15 @@ class _Reader(UrdfTree):
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
             self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; give a scale in the URDF")
         return np.asarray(hull)
+
+
+def _distinct(postures: list[Array]) -> tuple[tuple[float, ...], ...]:
+    """Return the first postures [rad] that differ from each other by more than `TUNING.seed_rad` in a joint."""
+    kept: list[Array] = []
+    for q in postures:
+        if all(np.abs(q - other).max() > TUNING.seed_rad for other in kept):
+            kept.append(q)
+    return tuple(tuple(q.tolist()) for q in kept[: TUNING.seeds])
 
 
 def _or(given: tuple[float, ...] | None, usual: Array) -> Array:

@@ -38,7 +38,7 @@ class ArmFile(Section):
     flange: str
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
     base: str | None = None
-    """Link where the arm begins, if it is part of a larger robot; links before it and branches off it are left out."""
+    """Link where the arm begins, if it is part of a larger robot; links before it are left out."""
     flange_rpy_rad: Vec3 = (0.0, 0.0, 0.0)
     """Turn from the axes of that link to those of the flange, if its z is not out of the arm."""
     home_rad: Joints | None = None
@@ -64,7 +64,7 @@ class ArmFile(Section):
     hold_damping_nms: Joints | None = None
     """Joint damping in a hold."""
     seeds_rad: tuple[Joints, ...] = ()
-    """Further postures from which inverse kinematics starts, with the first joint at zero."""
+    """Postures from which inverse kinematics starts; home and others that are sought if missing."""
 
 
 PLACEMENT: Final = ("level", "base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
