@@ -71,7 +71,8 @@ def _arm_pairs(robot: Robot) -> frozenset[tuple[int, int]]:
     data, results, touching = model.createData(), geometry.createData(), np.ones(len(pairs), dtype=bool)
     for request in results.collisionRequests:
         request.security_margin = COLLISION.margin_m
-    for q in np.random.default_rng(0).uniform(arm.lower_rad, arm.upper_rad, (COLLISION.postures, arm.joints)):
+    rng = np.random.Generator(np.random.PCG64(0))
+    for q in rng.uniform(arm.lower_rad, arm.upper_rad, (COLLISION.postures, arm.joints)):
         pin.computeCollisions(model, data, geometry, results, q, False)
         touching &= np.array([result.isCollision() for result in results.collisionResults], dtype=bool)
     tool = (arm.link_names[-1], *TOOL_LINKS)
