@@ -19,14 +19,14 @@ from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
 from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, count_causes
-from palpate_planning.setpoints import joint_setpoint
+from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
 from palpate_planning.views import Remainder, Views
-from palpate_planning.waits import FOR_FINDINGS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT
+from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits
 from palpate_planning.wall.wall import Wall, plane
 
 
@@ -80,7 +80,8 @@ class ExaminationSequence:
         self.status = self._course.status
         """State of the examination."""
         self._stops = Stops(self._course, known.limits.release_patience_s)
-        self._restart = RestartRamp()
+        self._restart, self._return_to_arm = RestartRamp(), ReturnToArm(step_s)
+        self._approach_waits = StrokeWaits(step_s)
         self._views = Views(look_postures(known))
         self._remainder = Remainder()
         self._requested = RequestedPresses(lockstep=lockstep)
@@ -138,7 +139,8 @@ class ExaminationSequence:
         self._stops.watch(now)
         step = ExamStep(course.contact)
         phase = self._phases.get(status.phase, _stay)
-        step.setpoint = phase(now, step) or course.arm.step(now.t, course.rate)
+        wanted = phase(now, step) or course.arm.step(now.t, course.rate)
+        step.setpoint = self._return_to_arm.step(wanted, course.contact.X_WI, now.reading.q)
         self._await_plan(now.t)
         return step
 
@@ -275,9 +277,15 @@ class ExaminationSequence:
             self._give_up(now, out, FOR_PLAN.end)
 
     def _approach(self, now: Observation, out: ExamStep) -> Setpoint | None:
-        course, known = self._course, self._known
-        if not course.arm.arrived:
+        course, known, waits = self._course, self._known, self._approach_waits
+        behind = course.arm.arrived and course.arm.behind(course.contact)
+        end = waits.step(FOR_JOINTS if behind else None)
+        if end:
+            course.abort(now, end)
+        elif behind or not course.arm.arrived:
             course.since = now.t
+            if waits.reported:
+                self.status.cause, self.status.message = waits.reported, waits.reported.text
         elif now.t - course.since >= EXAM.rest_ns:
             assert course.plan is not None
             course.palpation = Palpation(course.plan.segments, known, self._step_s, self._sense.wall, self.status.stroke)

@@ -14,11 +14,13 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
+from palpate_planning.contact import ContactMeasurement
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.setpoints import joint_setpoint
+from palpate_planning.stroke_motion import is_behind
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 from palpate_planning.waits import FOR_PLAN, WAIT
 
@@ -96,6 +98,10 @@ class FreeMotion:
     def q(self) -> Array:
         """Posture of the last set-point [rad], shape (n,)."""
         return self._trajectory.at(self._sample)[0]
+
+    def behind(self, contact: ContactMeasurement) -> bool:
+        """Return True if the arm is far from the last set-point."""
+        return is_behind(self.q, self._kinematics.pose(self.q), contact)
 
     def move_to(self, t: int, goal: Array, perceived: PerceivedAbdomen | None) -> bool:
         """Plan a motion to a posture [rad], shape (n,), then follow it; return True once there. Raises NoPathError."""

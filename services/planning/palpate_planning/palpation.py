@@ -25,7 +25,7 @@ from palpate_planning.reasons import Cause, Reason
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_REQUEST, FOR_WALL, StrokeWaits, Wait
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_REQUEST, FOR_WALL, StrokeWaits, Wait
 from palpate_planning.wall.wall import PublishedTouch, Wall
 
 
@@ -397,7 +397,9 @@ class Palpation:
         if stage in (StrokeStage.REST, StrokeStage.LIFT) and not self._watch.calm:
             return FOR_WALL if open_gate else FOR_BREATH
         returns = stage in (StrokeStage.REST, StrokeStage.LIFT, StrokeStage.TRANSFER)
-        if self._motion.behind or (returns and self.recovery.displacement is not None):
+        if self._motion.behind:
+            return FOR_JOINTS
+        if returns and self.recovery.displacement is not None:
             return FOR_ARM
         return FOR_BREATH if stage in (StrokeStage.SLIDE, StrokeStage.HOLD) and not open_gate else None
 

@@ -1,10 +1,13 @@
-"""The two kinds of set-point of planning, with the stiffness of each."""
+"""The two kinds of set-point of planning, with the stiffness of each, and how they return to the arm."""
 
+from math import cos
 from typing import Final
 
 import numpy as np
+import pinocchio as pin
 
-from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_bus.contract import contract
+from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_models.numerics.frames import Array
 
 
@@ -57,3 +60,45 @@ def cartesian_setpoint(
     """
     motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": np.zeros_like(q) if qd is None else qd}
     return AT_REST._replace(stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=np.full_like(q, POSTURE_STIFFNESS), **motion)
+
+
+RATE_SHARE: Final = 0.8
+"""Share of the contract's rates with which set-points return to the arm."""
+
+
+class ReturnToArm:
+    """Spreads a leap of the set-point to the arm over several periods, within the contract's rates.
+
+    A motion that ends early continues from the arm, which lags behind, was held, or does not follow at all. Any other leap is not
+    changed: the port refuses it.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        """`period_s`: of planning [s]."""
+        rates = contract().topics[TOPIC].rates
+        fields = ("pose.position", "pose.orientation", "joint_position")
+        self._step_m, self._step_rad, self._joint_step_rad = (RATE_SHARE * rates[field] * period_s for field in fields)
+        self._last: Setpoint | None = None
+
+    def step(self, wanted: Setpoint, X_WI: Array, q: Array) -> Setpoint:
+        """Return the set-point of a period; X_WI, shape (4, 4), and q [rad], shape (n,): measured pose and posture."""
+        last = self._last
+        self._last = wanted if last is None else self._limited(last, wanted, X_WI, q)
+        return self._last
+
+    def _limited(self, last: Setpoint, wanted: Setpoint, X_WI: Array, q: Array) -> Setpoint:
+        p_arm, change, turn = X_WI[:3, 3], wanted.p_WD - last.p_WD, wanted.q - last.q
+        length = float(np.linalg.norm(change))
+        if length > self._step_m and np.linalg.norm(wanted.p_WD - p_arm) < np.linalg.norm(last.p_WD - p_arm):
+            wanted = wanted._replace(p_WD=last.p_WD + change * (self._step_m / length))
+        if _cosine(last.R_WD, wanted.R_WD) < cos(self._step_rad) and _cosine(wanted.R_WD, X_WI) > _cosine(last.R_WD, X_WI):
+            phi = pin.log3(last.R_WD.T @ wanted.R_WD)
+            wanted = wanted._replace(R_WD=last.R_WD @ pin.exp3(phi * (self._step_rad / np.linalg.norm(phi))))
+        if np.abs(turn).max() > self._joint_step_rad and np.abs(wanted.q - q).max() < np.abs(last.q - q).max():
+            wanted = wanted._replace(q=last.q + np.clip(turn, -self._joint_step_rad, self._joint_step_rad))
+        return wanted
+
+
+def _cosine(R: Array, other: Array) -> float:
+    """Return the cosine of the angle between two orientations, of shape (3, 3) or part of a pose (4, 4)."""
+    return float((R * other[:3, :3]).sum() - 1) / 2

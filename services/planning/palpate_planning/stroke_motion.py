@@ -8,6 +8,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.kinematics import tool_pose
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
@@ -36,6 +37,8 @@ class MotionTuning(NamedTuple):
     """Fraction of the acceleration with which the motion along a path brakes."""
     behind_rad: float = 0.1
     """A free motion has arrived when no joint is this far behind: a real arm may be slowed down by its own controller."""
+    behind_m: float = 0.015
+    """Nor may the tool be this far behind: the stroke that follows begins where the tool is."""
     posture_radps: float = 10.0
     """Maximum speed of the posture in set-points of contact: near a singular wrist, that at the end of a path and that at the
     start of the next stroke are far apart."""
@@ -63,6 +66,12 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
     F_W[:3] = -point.n_W * push
     p_WD = point.p_W + point.n_W * distance
     return cartesian_setpoint(t, point.R_WD, p_WD, point.q, V_WD, F_W, point.dq_ds * rate)
+
+
+def is_behind(q: Array, X_WI: Array, contact: ContactMeasurement) -> bool:
+    """Return True if the arm is far from a set-point of free motion: joint positions q [rad], shape (n,), pose X_WI."""
+    away_m = float(np.linalg.norm(X_WI[:3, 3] - contact.X_WI[:3, 3]))
+    return away_m >= MOTION.behind_m or bool(np.abs(q - contact.q).max() >= MOTION.behind_rad)
 
 
 class StrokeMotion:
@@ -96,15 +105,18 @@ class StrokeMotion:
         self.segment = segment
         self.joined = self.joined and segment.free is None
         speed = self.speed_mps if segment.contact else MOTION.transfer_mps
-        self._speed_limit = segment.path.speed_limit(speed, self._limits.joint_velocity_scale * self._arm.velocity_radps)
-        self._acceleration = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
+        wanted = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
+        drives = self._robot.level is CommandLevel.POSITION  # an arm with an impedance lags behind and does not overshoot
+        self._acceleration = segment.path.acceleration_limit(wanted, self._arm.acceleration_radps2) if drives else wanted
+        velocity = self._limits.joint_velocity_scale * self._arm.velocity_radps
+        self._speed_limit = segment.path.speed_limit(speed, velocity, self._acceleration)
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
         self._following = True
         """False while a free motion pauses."""
-        self._behind_rad = 0.0
-        """Maximum distance of a joint from a free motion."""
+        self._behind = False
+        """True if the arm is far from the set-point of a free motion."""
         self._q_offset: Array | None = None
         """Measured less planned joint positions at the start of a free motion [rad], shape (n,); None until then."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
@@ -211,7 +223,7 @@ class StrokeMotion:
     def behind(self) -> bool:
         """True if the arm is not yet at the end of a free motion whose set-points are."""
         free = self.segment.free
-        return free is not None and self._sample >= len(free) - 1.0 and self._behind_rad >= MOTION.behind_rad
+        return free is not None and self._sample >= len(free) - 1.0 and self._behind
 
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
         """Regulate the measured depth towards the target depth.
@@ -261,6 +273,6 @@ class StrokeMotion:
         x = self._sample / last if last else 1.0
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
         q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
-        self._behind_rad = float(np.abs(q_now - contact.q).max())
-        self._posture = q_now
-        return joint_setpoint(t, tool_pose(q_now, self._robot), q_now, qd_now, self._arm.stiffness_nmprad)
+        X_WI = tool_pose(q_now, self._robot)
+        self._behind, self._posture = is_behind(q_now, X_WI, contact), q_now
+        return joint_setpoint(t, X_WI, q_now, qd_now, self._arm.stiffness_nmprad)

@@ -51,6 +51,13 @@ FOR_ARM: Final = _wait(
     Reason.ARM_DISPLACED,
     "the arm did not reach its path",
 )
+FOR_JOINTS: Final = _wait(
+    Reason.WAITS_FOR_ARM,
+    "waiting for the arm to follow control/joint_torque to the end of its motion",
+    Reason.ARM_DISPLACED,
+    "the arm did not follow control/joint_torque to the end of its motion",
+    "control/joint_torque",
+)
 FOR_REQUEST: Final = _wait(
     Reason.WAITS_FOR_REQUEST,
     "waiting above the skin: the search has not requested the next press",

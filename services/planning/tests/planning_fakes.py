@@ -1,12 +1,13 @@
 """Closed loop for the tests of planning: an ideal robot that follows set-points, a spring tissue, a perfect camera."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_bus.contract.port_check import PortCheck
+from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import TOOL
@@ -72,6 +73,13 @@ def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
 def hertz(newton_at_10mm: float) -> Callable[[float], float]:
     """Return the force [N] of the tissue's foundation by depth [m]."""
     return lambda depth: newton_at_10mm * (max(depth, 0.0) / 0.01) ** 1.45
+
+
+def check_at_port(setpoints: Iterable[Setpoint]) -> None:
+    """Send set-points through the check of their port; raises RefusedMessage."""
+    check = PortCheck(contract().topics[TOPIC], sends=True)
+    for setpoint in setpoints:
+        check(setpoint.message(), setpoint.stamp)
 
 
 class World:

@@ -9,6 +9,7 @@ import pytest
 from planning_fakes import BASE, PERIOD_S, known
 
 from palpate_bus.setpoint import Setpoint
+from palpate_models.robot.kinematics import tool_pose
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
@@ -150,7 +151,8 @@ def test_after_a_pause_in_a_free_motion_the_palpation_continues_with_the_next_se
     palpation.step(0, ABOVE)
     palpation.pause()
     palpation.skip_free_motion()
-    steps = [palpation.step(t, ABOVE._replace(q=q)) for t, q in zip(ticks(0, 10 * MS, len(MOTION)), MOTION.q, strict=True)]
+    contacts = [ABOVE._replace(q=q, X_WI=KINEMATICS.pose(q)) for q in MOTION.q]
+    steps = [palpation.step(t, now) for t, now in zip(ticks(0, 10 * MS, len(MOTION)), contacts, strict=True)]
     assert steps[-1].stage is StrokeStage.DONE
     assert np.array_equal(steps[-1].setpoint.q, MOTION.q[-1])
 
@@ -183,11 +185,19 @@ def test_a_free_motion_waits_for_an_arm_that_is_behind() -> None:
     motion._sample, motion._q_offset, motion._following = 0.0, None, True
     motion.setpoint(0, SimpleNamespace(q=HOME, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
     arrived = []
-    for behind in (0.3, STROKE_MOTION.behind_rad + 0.01, STROKE_MOTION.behind_rad - 0.01):
+    limit_rad, limit_m = STROKE_MOTION.behind_rad, STROKE_MOTION.behind_m
+    for rad, metres in (
+        (0.3, 0.0),
+        (limit_rad + 0.01, 0.0),
+        (limit_rad - 0.01, limit_m + 1e-3),
+        (limit_rad - 0.01, limit_m - 1e-3),
+    ):
         motion.follow_free_motion(1.0)
-        motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - behind, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
+        X_WI = tool_pose(Turn.q[-1], Robot())
+        X_WI[2, 3] -= metres
+        motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - rad, X_WI=X_WI), 1.0)  # type: ignore[arg-type]
         arrived.append(motion.follow_free_motion(1.0))
-    assert arrived == [False, False, True]
+    assert arrived == [False, False, False, True]
 
 
 def test_a_stroke_after_a_free_motion_begins_at_the_depth_of_the_arm() -> None:

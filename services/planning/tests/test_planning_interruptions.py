@@ -1,15 +1,19 @@
 """Tests of stops, pushes and unexpected motion of the wall: the examination waits, resumes or ends."""
 
+from collections import deque
+
 import numpy as np
 import pytest
-from planning_fakes import World, known
+from planning_fakes import PERIOD_S, World, check_at_port, known
 
-from palpate_bus.setpoint import ControlMode
+from palpate_bus.contract.port_check import RefusedMessage
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import WALL, WallWatch
 from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.wall.breath import Breath, BreathObservation
@@ -139,7 +143,9 @@ def push(world: World, aside: float, down: float) -> None:
 
 def test_an_arm_that_was_pushed_laterally_stops_pressing() -> None:
     world = stopped_in(Phase.SCAN, soft=False)
-    world.q = world.q + np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(4):
+        world.q = world.q + np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        world.step()
     world.stop = NO_CAUSE
     assert drawn_sideways(world) < 0.002
     assert world.exam.status.phase is Phase.ABORTED
@@ -278,6 +284,49 @@ def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> No
         assert np.abs(world.step().setpoint.q - before).max() < 0.01
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
+
+
+class LateWorld(World):
+    """A closed loop whose arm is 80 ms late."""
+
+    def _obey(self, setpoint: Setpoint) -> None:
+        self.late = getattr(self, "late", deque(maxlen=8))
+        self.late.append(setpoint)
+        super()._obey(self.late[0])
+
+
+def test_the_setpoint_returns_to_an_arm_that_is_stopped_in_a_fast_motion_without_a_leap() -> None:
+    world = LateWorld(known(**SMALL))
+    world.run(lambda: world.exam.status.phase is Phase.APPROACH)
+    farthest = 0.0
+    while not world.stop:
+        asked = world.step().setpoint
+        gap = float(np.linalg.norm(asked.p_WD - world.kinematics.pose(world.q)[:3, 3]))
+        world.stop = STOPPED if gap < farthest and farthest > 0.02 else NO_CAUSE
+        farthest = max(gap, farthest)
+    for _ in range(10):
+        world.step()
+    check_at_port(world.setpoints)
+    assert world.setpoints[-1].p_WD == pytest.approx(world.kinematics.pose(world.q)[:3, 3], abs=1e-9)
+
+
+@pytest.mark.parametrize(("back", "passes"), [(True, True), (False, False)])
+def test_only_a_leap_to_the_arm_is_spread(back: bool, passes: bool) -> None:
+    arm, away, still = np.array(lbr.HOME), np.array(lbr.HOME) + 0.1, np.zeros(7)
+    kinematics, ramp = World(known(**SMALL)).kinematics, ReturnToArm(PERIOD_S)
+    at = {True: arm, False: away}
+    sent = []
+    for k in range(30):
+        q = at[(k > 0) is back]
+        wanted = joint_setpoint(k * 10_000_000, kinematics.pose(q), q, still, still)
+        sent.append(ramp.step(wanted, kinematics.pose(arm), arm))
+    if passes:
+        check_at_port(sent)
+        assert sent[-1].p_WD == pytest.approx(kinematics.pose(arm)[:3, 3])
+        assert pytest.approx(kinematics.pose(arm)[:3, :3]) == sent[-1].R_WD
+    else:
+        with pytest.raises(RefusedMessage, match="pose"):
+            check_at_port(sent)
 
 
 def test_the_arm_lifts_before_a_sudden_force_and_presses_there_again() -> None:

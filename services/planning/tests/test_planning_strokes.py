@@ -9,17 +9,20 @@ from planning_fakes import known
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
+from palpate_models.robot import lbr
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.patterns import LIMITS
-from palpate_models.scenario.schema import Mode
+from palpate_models.scenario.schema import Mode, Robot
 from palpate_planning.interruptions import Displacement
 from palpate_planning.motion.kinematics import IkSolution
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.reasons import Cause
-from palpate_planning.stroke_motion import stroke_setpoint
+from palpate_planning.stroke_motion import StrokeMotion, stroke_setpoint
 from palpate_planning.strokes.coverage import TUNING, Stroke, strokes, touches
 from palpate_planning.strokes.path import SurfacePath, centre, frame, frames_along, least_twist
-from palpate_planning.strokes.segments import REACH, STRETCHED, SegmentPlanner
+from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner
 from palpate_planning.wall.surface import PerceivedSurface
+from palpate_planning.wall.wall import plane
 
 SPACING = 0.0125
 
@@ -163,6 +166,20 @@ def test_the_velocities_of_a_setpoint_are_its_rates_of_change() -> None:
         assert now.V_WD[:3] == pytest.approx((after.p_WD - before.p_WD) / (2 * dt), abs=1e-5)
         assert now.V_WD[3:] == pytest.approx(Rotation.from_matrix(after.R_WD @ before.R_WD.T).as_rotvec() / (2 * dt), abs=1e-3)
         assert now.qd == pytest.approx((after.q - before.q) / (2 * dt), abs=1e-5)
+
+
+@pytest.mark.parametrize(("level", "kept"), [(CommandLevel.POSITION, True), (CommandLevel.TORQUE, False)])
+def test_drives_can_follow_an_elbow_that_is_almost_straight(level: CommandLevel, kept: bool) -> None:
+    """The elbow turns by 20 rad per metre. An arm with an impedance yields."""
+    path, settings = dome_path(21), known(Robot(level=level))
+    path = SurfacePath(path.s, path.p, path.n, path.R, np.outer(20.0 * path.s, np.eye(7)[3]), path.targets, np.array([0, 10, 20]))
+    motion = StrokeMotion(settings.exam, settings.limits, settings.robot, 0.01, plane(np.eye(4)))
+    motion.start(Segment(path, contact=False))
+    elbow = [0.0]
+    while not motion.travel(path.length):
+        elbow.append(motion.point.q[3])
+    acceleration = np.abs(np.diff(elbow, 2)).max() / 0.01**2
+    assert bool(acceleration < 1.01 * lbr.ARM.acceleration_radps2[3]) is kept
 
 
 def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:

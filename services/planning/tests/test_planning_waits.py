@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, FRAME, PERIOD_S, World, known
+from planning_fakes import BASE, FRAME, PERIOD_S, World, check_at_port, known
 
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning import presses as requested, waits
@@ -148,6 +148,25 @@ def test_a_silent_perception_is_named_at_once() -> None:
     world.watch(silence)
     assert Reason.WAITS_FOR_PERCEPTION in world.reasons
     assert world.exam.status.cause.reason is Reason.VIEW_TIMEOUT
+
+
+def test_an_arm_that_does_not_follow_is_named_and_presses_nothing(limit_s: float) -> None:
+    world = World(known(**SMALL))
+    world.run(lambda: world.exam.status.phase is Phase.APPROACH)
+    world._obey = Mock()  # type: ignore[method-assign]
+    world.run(lambda: world.exam.status.cause.reason is Reason.WAITS_FOR_ARM)
+    world.run()
+    status = world.exam.status
+    assert (status.phase, status.cause.reason, status.cause.culprit) == (
+        Phase.ABORTED,
+        Reason.ARM_DISPLACED,
+        "control/joint_torque",
+    )
+    assert Phase.INDENT not in {row[0] for row in world.rows}
+    for _ in range(50):
+        world.step()
+    check_at_port(world.setpoints)
+    assert world.setpoints[-1].p_WD == pytest.approx(world.kinematics.pose(world.q)[:3, 3], abs=1e-9)
 
 
 def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:

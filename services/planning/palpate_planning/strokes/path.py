@@ -68,6 +68,8 @@ class PathLimits(NamedTuple):
     """Maximum rate at which the tool axis turns in contact [rad/s] (assumed)."""
     acceleration_mps2: float = 0.2
     """Tangential acceleration in contact [m/s^2] (assumed)."""
+    joint_acceleration_share: float = 0.7
+    """Share of a joint's acceleration for that along the path; the rest is for the path's curvature in joint space."""
 
 
 LIMITS = PathLimits()
@@ -127,10 +129,21 @@ class SurfacePath:
         visits, targets = self._order
         return targets[max(bisect_right(visits, s) - 1, 0)]
 
-    def speed_limit(self, speed: float, turning: Array) -> SpeedLimit:
+    def acceleration_limit(self, acceleration: float, joints: Array) -> float:
+        """Return the acceleration along the path: `acceleration` [m/s^2], less where that of a joint would exceed its maximum.
+
+        `joints`: maximum accelerations of the joints [rad/s^2], shape (n,). An elbow that is almost straight turns by 20 rad per
+        metre.
+        """
+        if self.length == 0.0:
+            return acceleration
+        turn = np.abs(np.gradient(self.q, self.s, axis=0)).max(axis=0)
+        return min(acceleration, LIMITS.joint_acceleration_share * float((joints / np.maximum(turn, 1e-6)).min()))
+
+    def speed_limit(self, speed: float, turning: Array, acceleration: float) -> SpeedLimit:
         """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast.
 
-        `turning`: maximum joint speeds [rad/s], shape (n,).
+        `turning`: maximum joint speeds [rad/s], shape (n,); `acceleration`: maximum along the path [m/s^2].
         """
         if self.length == 0.0:
             return SpeedLimit(self.s, np.array([speed]), LIMITS.acceleration_mps2)
@@ -141,7 +154,7 @@ class SurfacePath:
         turning_speed = np.minimum(LIMITS.turn_rate_radps / np.maximum(turn, 1e-6), 1.0 / np.maximum(joints.max(axis=1), 1e-6))
         curving_speed = np.sqrt(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6))
         allowed = np.minimum(np.minimum(curving_speed, turning_speed), speed)
-        return SpeedLimit(self.s, allowed, 0.7 * LIMITS.acceleration_mps2)
+        return SpeedLimit(self.s, allowed, 0.7 * min(acceleration, LIMITS.acceleration_mps2))
 
 
 def compile_ahead() -> None:
