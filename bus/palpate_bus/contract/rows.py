@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from enum import StrEnum
 from functools import cache
 from importlib import resources
-from typing import Annotated
+from typing import Annotated, Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -17,6 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import MS
 from palpate_bus.settings import Settings
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""PyYAML's parser in C where it was built: every process of a run reads the contract at its start."""
+_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class Edge(StrEnum):
@@ -248,7 +252,7 @@ class Contract(_Row):
 
 def parse(text: str) -> Contract:
     """Return the contract in a YAML text. Raises ValueError (pydantic's ValidationError) that names the row and field."""
-    raw = yaml.safe_load(text)
+    raw = yaml.load(text, _LOADER)
     for section in ("roles", "qos", "topics", "internal"):
         raw[section] = {name: {"name": name, **row} for name, row in raw[section].items()}
     return Contract.model_validate(raw)
@@ -259,7 +263,7 @@ def with_periods(text: str, periods: Mapping[str, int]) -> str:
 
     Periods of the role's topics are rounded up to multiples of the new period. Raises ValueError for an unknown role.
     """
-    document = yaml.safe_load(text)
+    document = yaml.load(text, _LOADER)
     for role, period_ms in periods.items():
         if role not in document["roles"]:
             raise ValueError(f"PALPATE_PERIODS: unknown role {role!r}; roles are {', '.join(document['roles'])}")
@@ -267,12 +271,12 @@ def with_periods(text: str, periods: Mapping[str, int]) -> str:
         for topic in document["topics"].values():
             if topic["producer"] == role and "period_ms" in topic:
                 topic["period_ms"] = -(-topic["period_ms"] // period_ms) * period_ms
-    return yaml.safe_dump(document, sort_keys=False)
+    return yaml.dump(document, Dumper=_DUMPER, sort_keys=False)
 
 
 def without(text: str, absent: Collection[str]) -> str:
     """Return the contract text without some optional roles and their topics. Raises ValueError if one is not optional."""
-    document = yaml.safe_load(text)
+    document = yaml.load(text, _LOADER)
     for role in absent:
         if not document["roles"].get(role, {}).get("optional"):
             optional = [name for name, row in document["roles"].items() if row.get("optional")]
@@ -281,7 +285,7 @@ def without(text: str, absent: Collection[str]) -> str:
         document["topics"] = {name: topic for name, topic in document["topics"].items() if topic["producer"] != role}
         for topic in document["topics"].values():
             topic["readers"].pop(role, None)
-    return yaml.safe_dump(document, sort_keys=False)
+    return yaml.dump(document, Dumper=_DUMPER, sort_keys=False)
 
 
 @cache
