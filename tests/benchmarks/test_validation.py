@@ -29,9 +29,9 @@ SECTIONS: dict[str, Callable[[], PageSection]] = {
     "surface tier against Hertz": lambda: hertz.section(hertz.measure((0.020,))),
     "mesh halving, lumps against the continuum, superposition": meshes.section,
     "relaxation": relaxation.section,
-    "some living people": lambda: people.section(people.measure(relaxed_people()[::6])),
+    "some living people": lambda: people.section(people.measure(relaxed_people()[::16])),
     "random cycles": lambda: energy.section(energy.measure(8)),
-    "population": population.section,
+    "population": lambda: population.section(population.sample_persons(100)),
     "buried lumps against finite elements": buried.section,
 }
 SLOW_SECTIONS = {

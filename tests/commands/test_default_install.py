@@ -76,16 +76,19 @@ def call_each(calls: dict[str, list[str]], folder: Path) -> dict[str, Called]:
     return {name: Called(int(status), *texts) for (name, status), texts in zip(ended, files, strict=True)}
 
 
-def test_the_help_of_each_command_needs_no_other_extra_and_imports_nothing_slow(tmp_path: Path) -> None:
-    for name, (status, out, err, slow) in call_each({name: [name, "--help"] for name in COMMANDS}, tmp_path).items():
+@pytest.fixture(scope="module")
+def called(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Called]:
+    helped = {f"{name} --help": [name, "--help"] for name in COMMANDS}
+    refused = {name: [name, *words] for name, words in CALLS.items()}
+    chosen = {one: ["run", "clean", "--service", one] for one in SERVICES}
+    return call_each({**helped, **refused, **chosen}, tmp_path_factory.mktemp("calls"))
+
+
+def test_the_help_of_each_command_needs_no_other_extra_and_imports_nothing_slow(called: dict[str, Called]) -> None:
+    for name in COMMANDS:
+        status, out, err, slow = called[f"{name} --help"]
         assert (status, err, slow) == (0, "", ""), name
         assert f"Usage: palpate {name}" in out
-
-
-@pytest.fixture(scope="module")
-def refused(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Called]:
-    calls = {name: [name, *words] for name, words in CALLS.items()}
-    return call_each({**calls, **{one: ["run", "clean", "--service", one] for one in SERVICES}}, tmp_path_factory.mktemp("calls"))
 
 
 def test_each_command_of_another_extra_has_a_call() -> None:
@@ -93,8 +96,8 @@ def test_each_command_of_another_extra_has_a_call() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(CALLS))
-def test_a_command_refuses_at_its_start_in_one_line_that_names_the_extra(name: str, refused: dict[str, Called]) -> None:
-    status, out, err, _ = refused[name]
+def test_a_command_refuses_at_its_start_in_one_line_that_names_the_extra(name: str, called: dict[str, Called]) -> None:
+    status, out, err, _ = called[name]
     assert (status, out) == (2, "")
     (line,) = err.splitlines()
     assert line.startswith(f"palpate: the command {name} needs ")
@@ -102,8 +105,8 @@ def test_a_command_refuses_at_its_start_in_one_line_that_names_the_extra(name: s
 
 
 @pytest.mark.parametrize("service", SERVICES)
-def test_a_service_of_another_extra_is_refused_before_anything_starts(service: str, refused: dict[str, Called]) -> None:
-    status, _, err, _ = refused[service]
+def test_a_service_of_another_extra_is_refused_before_anything_starts(service: str, called: dict[str, Called]) -> None:
+    status, _, err, _ = called[service]
     assert status == 2
     (line,) = err.splitlines()
     role, name = service.split("=")

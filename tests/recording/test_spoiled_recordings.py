@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate.interface.assessment import assess
+from palpate.interface.assessment import Assessment, assess
 from palpate.recording.faults import FaultCode
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
@@ -32,10 +32,11 @@ def pressed() -> pd.DataFrame:
     return table.assign(press=np.arange(len(table)) // (len(table) // 81))
 
 
-def probed(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table as probes: ten steps of each, without time and without a zero of the force."""
+@pytest.fixture(scope="module")
+def probed(pressed: pd.DataFrame) -> pd.DataFrame:
+    """The presses as probes: ten steps of each, without time and without a zero of the force."""
     rows = []
-    for number, press in table.groupby("press"):
+    for number, press in pressed.groupby("press"):
         down = press.iloc[: int(press.z.argmin()) + 1]
         deep = down[down.z < press.z.iloc[0] - 0.015].iloc[:: max(1, len(down) // 20)].iloc[:10]
         n = (press[P].iloc[0] - press[P].iloc[30]).to_numpy()
@@ -43,6 +44,11 @@ def probed(table: pd.DataFrame) -> pd.DataFrame:
     found = pd.concat(rows, ignore_index=True)
     found[F] -= ZERO
     return found
+
+
+@pytest.fixture(scope="module")
+def sound(pressed: pd.DataFrame) -> Assessment:
+    return assess(read(pressed, OVER_TIME))
 
 
 def read(table: pd.DataFrame, mapping: Mapping) -> PalpationRecording:
@@ -139,15 +145,15 @@ MAPPED = {
 
 
 @pytest.mark.parametrize(("change", "mapping"), MAPPED.values(), ids=MAPPED)
-def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, change, mapping: Mapping) -> None:
-    sound, recording = (read(*one) for one in ((pressed, OVER_TIME), (change(pressed), mapping)))
+def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, sound: Assessment, change, mapping: Mapping) -> None:
+    recording = read(change(pressed), mapping)
     assert not {fault.code for fault in recording.faults} - {FaultCode.FROZEN}
-    found, same = assess(recording), assess(sound)
-    place, usual = found.findings.iloc[0], same.findings.iloc[0]
+    found = assess(recording)
+    place, usual = found.findings.iloc[0], sound.findings.iloc[0]
     assert np.hypot(place.x_m - usual.x_m, place.y_m - usual.y_m) < 0.005
     assert usual.ratio_lower < place.ratio < usual.ratio_upper
-    inside = (found.map.apparent > same.map.lower) & (found.map.apparent < same.map.upper)
-    assert inside[: len(same.map.apparent)].mean() > 0.9
+    inside = (found.map.apparent > sound.map.lower) & (found.map.apparent < sound.map.upper)
+    assert inside[: len(sound.map.apparent)].mean() > 0.9
 
 
 C = FaultCode
@@ -207,8 +213,8 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("mapping", [OVER_TIME, PROBES], ids=["over-time", "probes"])
-def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, mapping: Mapping) -> None:
-    recording = read(probed(pressed) if mapping is PROBES else pressed, mapping)
+def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, probed: pd.DataFrame, mapping: Mapping) -> None:
+    recording = read(probed if mapping is PROBES else pressed, mapping)
     assert not recording.faults
     assert len(recording.touches) == 81
     assert abs(recording.depth_m - 0.010) < 0.0005
@@ -217,8 +223,10 @@ def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, mapp
 
 
 @pytest.mark.parametrize(("spoil", "mapping", "code"), SPOILED.values(), ids=SPOILED)
-def test_a_fault_is_named_and_adds_no_finding(pressed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode) -> None:
-    recording = read(spoil(probed(pressed) if mapping is PROBES else pressed), mapping)
+def test_a_fault_is_named_and_adds_no_finding(
+    pressed: pd.DataFrame, probed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode
+) -> None:
+    recording = read(spoil(probed if mapping is PROBES else pressed), mapping)
     fault = next(one for one in recording.faults if one.code is code)
     assert fault.count > 0
     assert fault.text

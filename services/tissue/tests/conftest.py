@@ -1,4 +1,4 @@
-"""Makes the foreign FMU importable and gives the tests one cache of compliances."""
+"""Makes the foreign FMU importable and gives the tests of the elastic tissue one cache of compliances."""
 
 import sys
 from collections.abc import Iterator
@@ -9,8 +9,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(autouse=True, scope="session")
-def shared_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+@pytest.fixture(autouse=True, scope="module")
+def shared_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """FMUs stay in the user's cache: a compiler without its own cache takes seconds more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        if "fmu" not in request.path.name:
+            patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "compliances"))
         yield
