@@ -5,7 +5,6 @@
 
 from collections.abc import Callable
 from functools import cache
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -72,29 +71,30 @@ def passer(name: str) -> Callable[[Message], Message | None]:
 
     Arrays and lists are copied, since their owner may write to them later. Arrays are read-only, as decoded ones are.
     """
-    fields = store.get_msgdef(name).fields
-    names = [field for field, _ in fields]
-    arrays = [(names.index(field), dtype) for field, dtype, _ in _array_fields(name)]
-    if not _exact(name, but=frozenset(names[k] for k, _ in arrays)):
+    lines, values = ["def passed(m):"], []
+    names: dict[str, Any] = {"Type": message_type(name), "Array": np.ndarray}
+    numbers = set()
+    for k, (field, (kind, detail)) in enumerate(store.get_msgdef(name).fields):
+        if kind not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            values.append(f"m.{field}")
+        elif detail[0][0] == Nodetype.NAME or detail[0][1][0] == "string":
+            values.append(f"list(m.{field})")
+        else:
+            names[f"dtype{k}"] = array_dtype(detail[0][1][0])
+            lines += (
+                f" v{k} = m.{field}",
+                f" if v{k}.__class__ is not Array or v{k}.dtype != dtype{k}: return None",
+                f" v{k} = v{k}.copy()",
+                f" v{k}.setflags(write=False)",
+            )
+            values.append(f"v{k}")
+            numbers.add(field)
+    if not _exact(name, but=frozenset(numbers)):
         return lambda _: None
-    if not arrays:
+    if not numbers:
         return lambda message: message
-    numbers = {k for k, _ in arrays}
-    lists = [k for k, (_, (kind, _)) in enumerate(fields) if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and k not in numbers]
-    make, values_of = message_type(name), attrgetter("__class__", *names)
-
-    def passed(message: Message) -> Message | None:
-        _, *values = values_of(message)
-        for k in lists:
-            values[k] = list(values[k])
-        for k, dtype in arrays:
-            array = values[k]
-            if array.__class__ is not np.ndarray or array.dtype != dtype:
-                return None
-            values[k] = array = array.copy()
-            array.flags.writeable = False
-        return make(*values)
-
+    exec(compile("\n".join((*lines, f" return Type({', '.join(values)})")), f"<passer of {name}>", "exec"), names)
+    passed: Callable[[Message], Message | None] = names["passed"]
     return passed
 
 
@@ -108,15 +108,3 @@ def _exact(name: str, but: frozenset[str] = frozenset()) -> bool:
         elif field not in but and (item[0] == "float32" or (kind != item_kind and item[0] != "string")):
             return False
     return True
-
-
-@cache
-def _array_fields(name: str) -> tuple[tuple[str, np.dtype[Any], int | None], ...]:
-    """Return name, type and length (None: any) of each array of numbers in a message type, without nested messages."""
-    found = []
-    for field, (kind, detail) in store.get_msgdef(name).fields:
-        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            item_kind, item = detail[0]
-            if item_kind == Nodetype.BASE and item[0] != "string":
-                found.append((field, array_dtype(item[0]), detail[1] if kind == Nodetype.ARRAY else None))
-    return tuple(found)
