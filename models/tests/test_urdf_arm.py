@@ -12,6 +12,7 @@ from palpate_errors import UserError
 from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.robot.urdf_arm import enclosing_capsule, read_arm
+from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
 
 TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "0.2 0 0")
@@ -211,6 +212,13 @@ def test_a_home_posture_is_found(tmp_path: Path) -> None:
     assert arm is not None, faults
     assert arm.posture(arm.home_rad)[1] == pytest.approx([0.0, 0.0, -1.0], abs=0.05)
     assert ((arm.lower_rad < arm.home_rad) & (arm.home_rad < arm.upper_rad)).all()
+
+
+def test_a_link_without_a_shape_is_not_drawn(tmp_path: Path) -> None:
+    """The camera could not merge its empty mesh."""
+    meshes = visual_meshes(Robot(arm=write(tmp_path, collision="")))
+    assert "link_3" not in meshes
+    assert all(meshes.values())
 
 
 def test_inverse_kinematics_starts_from_several_postures(tmp_path: Path) -> None:

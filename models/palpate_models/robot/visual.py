@@ -98,8 +98,8 @@ def visual_meshes(robot: Robot | None = None) -> dict[str, list[VisualMesh]]:
 
 
 def _capsules(arm: Arm) -> dict[str, list[VisualMesh]]:
-    shapes = zip(arm.link_names, arm.capsules, strict=False)  # the flange has none
-    return {link: [VisualMesh(*_capsule(capsule), WHITE) for capsule in capsules] for link, capsules in shapes}
+    shapes = zip(arm.link_names, arm.capsules, strict=False)  # the flange has none, and links of a URDF may have none
+    return {link: [VisualMesh(*_capsule(capsule), WHITE) for capsule in capsules] for link, capsules in shapes if capsules}
 
 
 def _capsule(capsule: Capsule) -> tuple[Array, NDArray[np.int32]]:
