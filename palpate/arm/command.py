@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from palpate_models.numerics.frames import Array
     from palpate_models.robot.chain import Arm
     from palpate_models.scenario.schema import Robot, Scenario
+    from palpate_planning.motion.scene import CollisionScene
 
 app = typer.Typer(name="arm", help="Check an arm, and find a place for its base.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next to a URDF.")]
@@ -85,6 +87,11 @@ def place(
     console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}")
     console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}")
     _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
+    touching = [pairs for q in deep.q[deep.reachable] if (pairs := _touching(arm, q))]
+    if touching:
+        named = "; ".join(sorted({pair for pairs in touching for pair in pairs}))
+        advice = "write another home_rad, or as flange a link further out, in the YAML file"
+        say(f"{arm}: {len(touching)} of {deep.reachable.sum()} postures touch: {named}: {advice}")
     at = chosen.model_copy(update={"robot": robot})
     if not look_postures(exam_input(at)):
         say(f"{arm}: home_rad: no posture to look from is free of collisions here: {_advice(arm, robot)}")
@@ -128,19 +135,26 @@ def _advice(arm: str, robot: Robot | None = None) -> str:
     return home_advice(found, arm_file(arm)).replace("the YAML file", arm_path(arm).name)
 
 
-def _touching(arm: str, home: Array, at: Robot | None = None) -> list[str]:
-    """Return the pairs of shapes of an arm, tool included, that are too close at `home` [rad], wherever its base stands.
+def _touching(arm: str, q: Array, at: Robot | None = None) -> list[str]:
+    """Return the pairs of shapes of an arm, tool included, that are too close at `q` [rad], wherever its base stands.
 
     With `at`, also those of the arm and the table or base there.
     """
     from palpate_models.robot.table import boxes
-    from palpate_models.scenario.schema import Limits, Robot
+    from palpate_models.scenario.schema import Robot
+
+    robot = at or Robot(arm=arm)
+    found = _scene(robot).collisions(q)
+    return [pair for pair in found if at is not None or not any(pair.endswith(box.name) for box in boxes(robot))]
+
+
+@cache
+def _scene(robot: Robot) -> CollisionScene:
+    from palpate_models.scenario.schema import Limits
     from palpate_planning.motion.kinematics import ArmKinematics
     from palpate_planning.motion.scene import CollisionScene
 
-    robot = at or Robot(arm=arm)
-    found = CollisionScene(ArmKinematics(robot, Limits()), robot).collisions(home)
-    return [pair for pair in found if at is not None or not any(pair.endswith(box.name) for box in boxes(robot))]
+    return CollisionScene(ArmKinematics(robot, Limits()), robot)
 
 
 def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:
