@@ -68,19 +68,25 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
     """Return the robot on the base placement with the lowest cost over the scenario's region.
 
-    It is rounded to centimetres and hundredths of a radian. Raises RunError with the best attempt if no start converges.
+    It is rounded to centimetres and hundredths of a radian. A placement counts whose targets inverse kinematics reaches, as an
+    examination has to. Raises RunError with the best attempt if there is none.
     """
     contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
     raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
     starts = (base_of(scenario.robot), *map(np.array, STARTS))
     attempts = [_optimise(scenario.robot, positions, normals, start) for start in starts]
-    cost, robot = min(attempts, key=itemgetter(0))
-    if cost < np.inf:
+    home, tried = arm_of(scenario.robot).home_rad, []
+    converged = [pair for pair in attempts if pair[0] < np.inf]
+    for _, robot in sorted(converged or attempts, key=itemgetter(0)):
+        postures = plan_redundancy(robot, positions, normals, home)
+        if converged and postures.reachable.all():
+            return robot
+        tried.append((robot, postures))
+    robot, postures = max(tried, key=lambda pair: pair[1].reachable.sum())
+    if converged and postures.reachable.any():
         return robot
-    home = arm_of(robot).home_rad
-    tried = [(robot, plan_redundancy(robot, positions, normals, home)) for _, robot in attempts]
-    best = describe(*max(tried, key=lambda pair: pair[1].reachable.sum()))
+    best = describe(robot, postures)
     raise RunError(
         f"no base placement found; the best attempt is at {best}. The robot's base_xy_m, base_height_m and base_yaw_rad are "
         "tried first: give others, or a smaller exam.region_m"

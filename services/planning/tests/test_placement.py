@@ -127,3 +127,12 @@ def test_default_base_is_what_the_optimisation_finds() -> None:
     from palpate.arm.placement import best_placement
 
     np.testing.assert_allclose(base_of(best_placement(Scenario())), base_of(ROBOT), atol=0.011)
+
+
+def test_a_placement_counts_by_what_inverse_kinematics_reaches(monkeypatch: pytest.MonkeyPatch) -> None:
+    from palpate.arm import placement
+
+    far = ROBOT.model_copy(update={"base_xy_m": (-2.0, 0.0)})
+    found = iter(((1.0, far), (2.0, ROBOT), (3.0, far), (4.0, far)))
+    monkeypatch.setattr(placement, "_optimise", lambda *_: next(found))
+    assert placement.best_placement(Scenario(), spacing=0.1) == ROBOT
