@@ -19,7 +19,7 @@ from palpate_bus.recordings import open_recording
 from palpate_recorder.recover import recover
 
 SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
-TWO_LINES = (*TINY, "exam.region_m=[0.06, 0.03]", "exam.spacing_m=0.02")
+THREE_LINES = (*TINY, "exam.region_m=[0.04, 0.03]", "exam.spacing_m=0.02")
 Blow = Callable[[psutil.Process], None]
 
 
@@ -35,13 +35,13 @@ def interrupt(run: psutil.Process) -> None:
     run.send_signal(signal.SIGINT)
 
 
-def interrupted(folder: Path, blow: Blow, *options: str, settings: tuple[str, ...] = SMALL) -> None:
-    """Run an examination and strike it while its indenter slides along its second line."""
+def interrupted(folder: Path, blow: Blow, *options: str, settings: tuple[str, ...] = SMALL, line_number: int = 2) -> None:
+    """Run an examination and strike it while its indenter slides along a line, counted from 1."""
     run = subprocess.Popen(command("clean", folder, *options, settings=settings), stderr=subprocess.PIPE, text=True)
     scans = 0
     for line in run.stderr:
         scans += " scan " in line
-        if scans == 2:
+        if scans == line_number:
             scans += 1
             blow(psutil.Process(run.pid))
     assert run.wait(timeout=120) != 0
@@ -94,7 +94,7 @@ def check(folder: Path, resumed: Finished) -> None:
 def test_a_killed_examination_is_resumed_once(tmp_path: Path) -> None:
     """The whole command is killed, with its recorder."""
     folder = tmp_path / "broken"
-    interrupted(folder, kill, "--composed", settings=TWO_LINES)
+    interrupted(folder, kill, "--composed", settings=THREE_LINES, line_number=3)
     check(folder, resume(folder, "--composed", "--record", "none"))
     again = resume(folder, "--composed")
     assert again.status == 2
