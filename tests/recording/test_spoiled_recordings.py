@@ -28,8 +28,8 @@ PROBES = Mapping(
 @pytest.fixture(scope="module")
 def pressed() -> pd.DataFrame:
     """A raster of presses over a lump, over time, with the number of the press."""
-    table = runpy.run_path(str(EXAMPLE))["recording"]()
-    return table.assign(press=np.arange(len(table)) // (len(table) // 81))
+    table = runpy.run_path(str(EXAMPLE))["recording"](spacing=0.015)
+    return table.assign(press=np.arange(len(table)) // (len(table) // 49))
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ SPOILED = {
 def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, probed: pd.DataFrame, mapping: Mapping) -> None:
     recording = read(probed if mapping is PROBES else pressed, mapping)
     assert not recording.faults
-    assert len(recording.touches) == 81
+    assert len(recording.touches) == 49
     assert abs(recording.depth_m - 0.010) < 0.0005
     (place,) = assess(recording).findings[["x_m", "y_m"]].to_numpy()
     assert np.linalg.norm(place - (-0.055, -0.055)) < 0.008
