@@ -7,6 +7,8 @@ PYTHON ?= python3
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
+# Tests start hundreds of processes: modules are compiled once.
+unexport PYTHONDONTWRITEBYTECODE
 # Two processes share the tests; tests/conftest.py keeps related tests together.
 TWO_WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 
