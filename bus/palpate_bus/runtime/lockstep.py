@@ -336,7 +336,16 @@ class Stepper:
 
         Raises LockstepError if a periodic message is missing or is sent off its tick.
         """
-        return [one for part in self.parts(t) for one in part]
+        blame = self.blame
+        begin, decoded, encoded = perf_counter_ns(), blame.decode, blame.encode
+        sent: list[Outgoing] = []
+        for outbox in self._outboxes(t):
+            stepped = perf_counter_ns()
+            sent += self._pack_outbox(outbox, t)
+            blame.encode += perf_counter_ns() - stepped
+        self._close(t)
+        blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
+        return sent
 
     def parts(self, t: int) -> Iterator[list[Outgoing]]:
         """Do what `step` does, but yield the messages of each part of the step before the next is computed."""
