@@ -1,7 +1,7 @@
 """The sequence of the examination: home, look, plan, approach, indent, scan, retract, return, assess, done."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +57,14 @@ class ExaminationSequence:
     """Runs one examination. `step` each planning period; `status` is what exam/state reports."""
 
     def __init__(
-        self, known: ExamInput, step_s: float, frame_ns: int, before: Checkpoint | None = None, *, lockstep: bool = True
+        self,
+        known: ExamInput,
+        step_s: float,
+        frame_ns: int,
+        rates: Mapping[str, float],
+        before: Checkpoint | None = None,
+        *,
+        lockstep: bool = True,
     ) -> None:
         """Start at home.
 
@@ -65,6 +72,7 @@ class ExaminationSequence:
             known: the exam input.
             step_s: period of planning [s].
             frame_ns: period of the camera [ns].
+            rates: maximum rates of change of a set-point by field.
             before: state of the interrupted examination that this one resumes.
             lockstep: True if heavy planning takes exactly its simulated time; else it takes at least that.
         """
@@ -80,7 +88,7 @@ class ExaminationSequence:
         self.status = self._course.status
         """State of the examination."""
         self._stops = Stops(self._course, known.limits.release_patience_s)
-        self._restart, self._return_to_arm = RestartRamp(), ReturnToArm(step_s)
+        self._restart, self._return_to_arm = RestartRamp(), ReturnToArm(step_s, rates)
         self._approach_waits = StrokeWaits(step_s)
         self._views = Views(look_postures(known))
         self._remainder = Remainder()

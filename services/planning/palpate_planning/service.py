@@ -14,6 +14,7 @@ from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.setpoint import TOPIC
 from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
@@ -59,8 +60,9 @@ class PlanningService(Service):
         if not lockstep:
             _lower_worker_priority()
         step_s, frame_ns = roles["planning"].period / SECOND, roles["camera"].period
-        self._exam = ExaminationSequence(known, step_s, frame_ns, before, lockstep=lockstep)
-        self._max_silence = contract().topics["planning/setpoint"].expiry
+        setpoints = contract().topics[TOPIC]
+        self._exam = ExaminationSequence(known, step_s, frame_ns, setpoints.rates, before, lockstep=lockstep)
+        self._max_silence = setpoints.expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._peak_force = 0.0

@@ -1,13 +1,13 @@
 """The two kinds of set-point of planning, with the stiffness of each, and how they return to the arm."""
 
-from math import cos
+from collections.abc import Mapping
+from math import cos, sqrt
 from typing import Final
 
 import numpy as np
 import pinocchio as pin
 
-from palpate_bus.contract import contract
-from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
+from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.numerics.frames import Array
 
 
@@ -73,9 +73,8 @@ class ReturnToArm:
     changed: the port refuses it.
     """
 
-    def __init__(self, period_s: float) -> None:
-        """`period_s`: of planning [s]."""
-        rates = contract().topics[TOPIC].rates
+    def __init__(self, period_s: float, rates: Mapping[str, float]) -> None:
+        """`period_s`: of planning [s]; `rates`: maximum rates of change by field, as the contract has them."""
         fields = ("pose.position", "pose.orientation", "joint_position")
         self._step_m, self._step_rad, self._joint_step_rad = (RATE_SHARE * rates[field] * period_s for field in fields)
         self._last: Setpoint | None = None
@@ -88,7 +87,7 @@ class ReturnToArm:
 
     def _limited(self, last: Setpoint, wanted: Setpoint, X_WI: Array, q: Array) -> Setpoint:
         p_arm, change, turn = X_WI[:3, 3], wanted.p_WD - last.p_WD, wanted.q - last.q
-        length = float(np.linalg.norm(change))
+        length = sqrt(change.dot(change))
         if length > self._step_m and np.linalg.norm(wanted.p_WD - p_arm) < np.linalg.norm(last.p_WD - p_arm):
             wanted = wanted._replace(p_WD=last.p_WD + change * (self._step_m / length))
         if _cosine(last.R_WD, wanted.R_WD) < cos(self._step_rad) and _cosine(wanted.R_WD, X_WI) > _cosine(last.R_WD, X_WI):

@@ -25,6 +25,7 @@ from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
 
 PERIOD, FRAME = contract().roles["planning"].period, contract().roles["camera"].period
+RATES = contract().topics[TOPIC].rates
 PERIOD_S = PERIOD / SECOND
 
 BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
@@ -103,7 +104,7 @@ class World:
         self.misled = 0.0
         """Error of the forecasts [m], alternating outward and inward."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = ExaminationSequence(settings, PERIOD_S, FRAME)
+        self.exam = ExaminationSequence(settings, PERIOD_S, FRAME, RATES)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
         self.weight = self.exam._sense.compensation
         self.bias = np.array([0.7, -0.4, 1.1])

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import FRAME, PERIOD_S, World, hertz, known
+from planning_fakes import FRAME, PERIOD_S, RATES, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
@@ -172,7 +172,7 @@ def test_soft_stop_skips_targets_then_gives_up() -> None:
     ],
 )
 def test_only_what_is_complete_is_called_so(cause: Cause, count: int, phase: Phase, text: str) -> None:
-    exam = ExaminationSequence(known(), PERIOD_S, FRAME)
+    exam = ExaminationSequence(known(), PERIOD_S, FRAME, RATES)
     exam.status.target_count, exam.skipped = 20, dict.fromkeys(range(count), cause)
     exam._conclude(0)
     assert exam.status.phase is phase

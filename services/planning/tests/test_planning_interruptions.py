@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 import pytest
-from planning_fakes import PERIOD_S, World, check_at_port, known
+from planning_fakes import PERIOD_S, RATES, World, check_at_port, known
 
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.setpoint import ControlMode, Setpoint
@@ -313,7 +313,7 @@ def test_the_setpoint_returns_to_an_arm_that_is_stopped_in_a_fast_motion_without
 @pytest.mark.parametrize(("back", "passes"), [(True, True), (False, False)])
 def test_only_a_leap_to_the_arm_is_spread(back: bool, passes: bool) -> None:
     arm, away, still = np.array(lbr.HOME), np.array(lbr.HOME) + 0.1, np.zeros(7)
-    kinematics, ramp = World(known(**SMALL)).kinematics, ReturnToArm(PERIOD_S)
+    kinematics, ramp = World(known(**SMALL)).kinematics, ReturnToArm(PERIOD_S, RATES)
     at = {True: arm, False: away}
     sent = []
     for k in range(30):

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, FRAME, PERIOD_S, World, check_at_port, known
+from planning_fakes import BASE, FRAME, PERIOD_S, RATES, World, check_at_port, known
 
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning import presses as requested, waits
@@ -170,7 +170,7 @@ def test_an_arm_that_does_not_follow_is_named_and_presses_nothing(limit_s: float
 
 
 def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:
-    exam = ExaminationSequence(known(BASE, **SMALL), PERIOD_S, FRAME)
+    exam = ExaminationSequence(known(BASE, **SMALL), PERIOD_S, FRAME, RATES)
     reasons = {}
     for k in range(round(2 * WAIT.limit_s)):
         exam.step(Observation(7 * SECOND + k * SECOND, None))
