@@ -53,9 +53,9 @@ FOR_ARM: Final = _wait(
 )
 FOR_JOINTS: Final = _wait(
     Reason.WAITS_FOR_ARM,
-    "waiting for the arm to follow control/joint_torque to the end of its motion",
+    "waiting for the arm to reach the end of its motion by planning/setpoint and control/joint_torque",
     Reason.ARM_DISPLACED,
-    "the arm did not follow control/joint_torque to the end of its motion",
+    "the arm did not reach the end of its motion by planning/setpoint and control/joint_torque",
     "control/joint_torque",
 )
 FOR_REQUEST: Final = _wait(
