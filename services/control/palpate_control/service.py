@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -119,8 +120,8 @@ class ControlService(Service):
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
         q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
-        if not (joints.name == self._names and q.shape == qd.shape == self._still.shape):
-            wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}"
+        if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
+            wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}, finite"
             return self._stop_commands(t, Problem("joint_states", wrong))
         if self._admittance is not None and (stale := self._sense(self._admittance, t, inbox)):
             return self._repeat(t, stale)
@@ -144,6 +145,10 @@ class ControlService(Service):
         if counts != {self.model.joints}:
             names = "joint_position, joint_velocity, joint_stiffness"
             self._refuse(t, f"{names}: {sorted(counts)} values, expected {self.model.joints} each")
+            return
+        motion = (setpoint.p_WD, setpoint.V_WD, setpoint.F_W, setpoint.stiffness, setpoint.damping_ratio)
+        if not np.isfinite(np.concatenate((*motion, setpoint.q, setpoint.qd, setpoint.joint_stiffness))).all():
+            self._refuse(t, "has values that are not finite")
             return
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS
