@@ -100,4 +100,4 @@ class ReturnToArm:
 
 def _cosine(R: Array, other: Array) -> float:
     """Return the cosine of the angle between two orientations, of shape (3, 3) or part of a pose (4, 4)."""
-    return float((R * other[:3, :3]).sum() - 1) / 2
+    return (float(np.vdot(R, other[:3, :3])) - 1) / 2

@@ -1,5 +1,6 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
+from math import exp
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -104,21 +105,28 @@ class MotionAgreement:
         """Return the breaches at a measurement, `since_s` [s] after the one before."""
         before, self._before = self._before, measured
         moved = measured.q - (measured.q if before is None else before.q)
-        if before is None or not 0 < since_s < self.WINDOW_S or np.abs(moved).max() > self.JUMP_RADPS * since_s:
+        if before is None or not 0 < since_s < self.WINDOW_S or _largest(moved) > self.JUMP_RADPS * since_s:
             self._gap = np.zeros_like(measured.q)
             return []
         turned = 0.5 * (measured.qd + before.qd) * since_s
-        against = (moved * turned < 0) & (np.minimum(np.abs(moved), np.abs(turned)) > self.AGAINST_RAD)
-        self._against = self._against + 1 if against.any() else 0
-        gap = (self._gap + moved - turned) * np.exp(-since_s / self.WINDOW_S)
-        self._gap = np.clip(gap, -2 * self.LIMIT_RAD, 2 * self.LIMIT_RAD)  # it is over within the window when they agree again
-        if (gap := float(np.abs(self._gap).max())) > self.LIMIT_RAD:
+        pairs = zip(moved.tolist(), turned.tolist(), strict=True)
+        against = any(a * b < 0 and min(abs(a), abs(b)) > self.AGAINST_RAD for a, b in pairs)
+        self._against = self._against + 1 if against else 0
+        gap = (self._gap + moved - turned) * exp(-since_s / self.WINDOW_S)
+        most = 2 * self.LIMIT_RAD  # it is over within the window when they agree again
+        self._gap = np.minimum(np.maximum(gap, -most), most)
+        if (gap := _largest(self._gap)) > self.LIMIT_RAD:
             reason = f"positions and velocities disagree by {gap:.2f} rad, limit {self.LIMIT_RAD:g} rad"
         elif self._against > 1:
             reason = "positions move against the velocities"
         else:
             return []
         return [Breach(Level.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=STATUS)]
+
+
+def _largest(x: Array) -> float:
+    """Return the largest magnitude in a small array, faster than numpy does."""
+    return max(map(abs, x.tolist()))
 
 
 class DepthAgreement:
