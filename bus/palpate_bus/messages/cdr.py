@@ -55,15 +55,11 @@ _LENGTHS = layouts("I")
 
 def pack_text(text: str, position: int) -> bytes:
     """Return a string that starts at `position`, padding included."""
-    return _pack_short(text, position & 3) if len(text) < _SHORT else _pack(text, position)
-
-
-def _pack(text: str, position: int) -> bytes:
     characters = text.encode() + b"\0"
     return _LENGTHS[position & 7].pack(len(characters)) + characters
 
 
-_pack_short = lru_cache(maxsize=256)(_pack)
+pack_short = lru_cache(maxsize=256)(pack_text)
 
 
 @lru_cache(maxsize=64)
@@ -71,7 +67,7 @@ def pack_texts(texts: tuple[str, ...], position: int) -> bytes:
     """Return strings one after another, the first at `position`."""
     data = b""
     for text in texts:
-        data += _pack(text, position + len(data))
+        data += pack_text(text, position + len(data))
     return data
 
 
@@ -103,14 +99,10 @@ def fit(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDA
     Raises ValueError that names the field for another shape, or for an unsafe conversion (text, complex numbers, fractions for an
     integer field).
     """
-    array: NDArray[Any]
-    if value.__class__ is np.ndarray and value.dtype == dtype and value.flags.c_contiguous:
-        array = value
-    else:
-        array = np.asarray(value)
-        if not (np.can_cast(array.dtype, dtype, "same_kind") or array.size == 0):
-            raise ValueError(f"{field}: has {array.dtype}, expected {dtype}")
-        array = np.ascontiguousarray(array, dtype) if array.ndim else array
+    array: NDArray[Any] = np.asarray(value)
+    if not (np.can_cast(array.dtype, dtype, "same_kind") or array.size == 0):
+        raise ValueError(f"{field}: has {array.dtype}, expected {dtype}")
+    array = np.ascontiguousarray(array, dtype) if array.ndim else array
     if array.ndim != 1 or (length is not None and array.size != length):
         raise ValueError(f"{field}: has shape {array.shape}, expected ({'n' if length is None else length},)")
     return array
@@ -143,6 +135,7 @@ class _Source:
         self._names: dict[str, Any] = {
             one.__name__: one for one in (fit, check_length, pack_text, pack_texts, read_text, read_length, read_array)
         }
+        self._names |= {"pack_short": pack_short, "Array": np.ndarray}
         """What the lines use besides their variables."""
         self._run: list[tuple[str, str]] = []
         """Numbers that are not packed or unpacked yet: expression and code of `struct`."""
@@ -192,7 +185,8 @@ class _Source:
             else:
                 yield from self.pack()
                 if kind == Nodetype.BASE:
-                    yield f"data += pack_text({here}, len(data))"
+                    pack = f"pack_short if len({here}) < {_SHORT} else pack_text"
+                    yield f"data += ({pack})({here}, len(data) & 3)"
                 else:
                     yield from self._encode_items(detail[0], here, there, detail[1] if kind == Nodetype.ARRAY else None)
 
@@ -202,7 +196,10 @@ class _Source:
         items = self._new()
         if kind == Nodetype.BASE and detail[0] != "string":
             dtype = array_dtype(detail[0])
-            yield f"{items} = fit({here}, {self._constant(dtype)}, {length}, {path!r})"
+            wanted, shape = self._constant(dtype), "ndim == 1" if length is None else f"shape == ({length},)"
+            fits = f"{items}.__class__ is Array and {items}.dtype == {wanted} and {items}.{shape} and {items}.flags.c_contiguous"
+            yield f"{items} = {here}"
+            yield f"if not ({fits}): {items} = fit({items}, {wanted}, {length}, {path!r})"
             if length is None:
                 length_packs = f"({self._padded} if {items}.size else {self._lengths})" if dtype.itemsize == 8 else self._lengths
                 yield f"data += {length_packs}[len(data) & 7]({items}.size)"

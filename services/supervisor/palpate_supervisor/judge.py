@@ -126,7 +126,7 @@ class MotionAgreement:
 
 def _largest(x: Array) -> float:
     """Return the largest magnitude in a small array, faster than numpy does."""
-    return max(map(abs, x.tolist()))
+    return float(max(map(abs, x.tolist())))
 
 
 class DepthAgreement:
