@@ -115,8 +115,8 @@ class MotionAgreement:
         gap = (self._gap + moved - turned) * exp(-since_s / self.WINDOW_S)
         most = 2 * self.LIMIT_RAD  # it is over within the window when they agree again
         self._gap = np.minimum(np.maximum(gap, -most), most)
-        if (gap := _largest(self._gap)) > self.LIMIT_RAD:
-            reason = f"positions and velocities disagree by {gap:.2f} rad, limit {self.LIMIT_RAD:g} rad"
+        if (apart := _largest(self._gap)) > self.LIMIT_RAD:
+            reason = f"positions and velocities disagree by {apart:.2f} rad, limit {self.LIMIT_RAD:g} rad"
         elif self._against > 1:
             reason = "positions move against the velocities"
         else:
