@@ -136,7 +136,7 @@ class _Source:
             one.__name__: one for one in (fit, check_length, pack_text, pack_texts, read_text, read_length, read_array)
         }
         self._names |= {"pack_short": pack_short, "Array": np.ndarray}
-        """What the lines use besides their variables."""
+        """Functions and constants that the lines use."""
         self._run: list[tuple[str, str]] = []
         """Numbers that are not packed or unpacked yet: expression and code of `struct`."""
         self._count = 0
