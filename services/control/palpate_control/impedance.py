@@ -139,7 +139,7 @@ class ImpedanceController:
             self._cartesian_gains = cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time)
         arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
         R_DI = R_WD.T.dot(model.R_WI)
-        gains, torque = tuple(self._cartesian_gains), np.empty_like(q)
+        gains, torque = tuple(self._cartesian_gains), np.empty(len(q))
         cartesian_torque(arm, R_WD, x, pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction, torque)
         return torque
 

@@ -38,7 +38,7 @@ class SafetyNet:
 
         The torque, and the torque plus `gravity`, are within limits.
         """
-        safe = np.empty_like(self._last)
+        safe = np.empty(len(q))
         safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, self.peak, safe)
         self._last = safe
         return safe
