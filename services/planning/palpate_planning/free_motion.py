@@ -7,7 +7,7 @@ depend on the speed of the machine. In wall-clock mode the result is used when i
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -32,14 +32,19 @@ class Worker:
 
     def __init__(self) -> None:
         self._start()
-        os.register_at_fork(after_in_child=self._start)  # a forked child has none of its parent's threads
+        # A forked child has none of its parent's threads, so the tasks are finished before.
+        os.register_at_fork(before=lambda: wait(self._submitted), after_in_child=self._start)
 
     def _start(self) -> None:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
+        self._submitted: list[Future[Any]] = []
+        """The latest task."""
 
     def submit(self, work: Callable[..., T], *arguments: Any) -> Future[T]:
         """Return the future result of `work`."""
-        return self._pool.submit(work, *arguments)
+        future = self._pool.submit(work, *arguments)
+        self._submitted = [future]
+        return future
 
 
 WORKER = Worker()

@@ -1,7 +1,9 @@
 """Tests of free motions: background worker, trajectory following, and missed steps."""
 
+import os
 from itertools import pairwise
 from threading import Event
+from time import sleep
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +15,7 @@ from palpate_models.robot.kinematics import tool_pose
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.free_motion import BackgroundTask, FreeMotion
+from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import TIMING, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
@@ -221,3 +223,11 @@ def test_the_posture_of_a_setpoint_moves_no_faster_than_its_limit() -> None:
         postures += [motion.setpoint(0, SimpleNamespace(q=HOME), 1.0).q for _ in range(8)]  # type: ignore[arg-type]
     assert np.abs(np.diff(postures, axis=0)).max() <= STROKE_MOTION.posture_radps * 0.01 + 1e-9
     np.testing.assert_array_equal(postures[-1], HOME + 0.5)
+
+
+def test_a_fork_waits_for_the_planning_thread() -> None:
+    future = WORKER.submit(sleep, 0.1)
+    child = os.fork()
+    if not child:
+        os._exit(not future.done())
+    assert os.waitpid(child, 0)[1] == 0
