@@ -25,6 +25,8 @@ class SamplingLimits(NamedTuple):
     """Minimum share of the samples that are due."""
     every_m: float = 0.01
     """Travel within which a sample is due [m], twice that of the default assessment."""
+    for_map: int = 10
+    """Samples from which a map is expected: the assessment's minimum."""
 
 
 SAMPLING = SamplingLimits()
@@ -176,7 +178,10 @@ def unsampled(collected: Collected, exam: Exam) -> Failure | None:
         return None
     felt = int(last.target_count - last.targets_skipped)
     if samples >= SAMPLING.min_share * felt * min(1.0, exam.spacing_m / SAMPLING.every_m):
-        return None
+        if samples < SAMPLING.for_map or collected.stiffness_map is not None:
+            return None
+        text = f"{samples} samples at {felt} targets that planning calls felt, and too few of them are good for a map"
+        return Failure(FailureCode.UNSAMPLED, text, ("planning", "assessment"), ("exam/state", "assessment/samples"))
     if not samples and any(state.steady for state in collected.exam_states):  # an assessment that publishes none
         return None
     text = f"{samples} samples at {felt} targets that planning calls felt: exam/state was not steady, or assessment lost messages"

@@ -108,6 +108,8 @@ def test_targets_that_were_not_sampled_are_not_complete(samples: int, spacing_m:
     done = exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS, target_count=9, targets_skipped=1)
     found = unsampled(Collected([done], samples=[None] * samples), exam)
     assert (found is None) == complete
+    assert unsampled(Collected([done], samples=[None] * 10), exam) is not None, "ten samples without a map"
+    assert unsampled(Collected([done], samples=[None] * 10, stiffness_map=object()), exam) is None
     scanning = exam_state(NS, ExamState.PHASE_SCAN, steady=True)
     assert unsampled(Collected([scanning, done]), exam) is None, "an assessment need not publish samples"
 
