@@ -4,9 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Final
 
-from palpate_bus.messages import ExamState, Point, Vector3
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import blank, header
+from palpate_bus.messages import ExamState, Message, Point, Vector3, blank, header
 
 AT_REST: Final[ExamState] = replace(blank("palpation_msgs/msg/ExamState"), end_tick=-1)
 """Fields without contact."""

@@ -85,7 +85,7 @@ class Prospect(NamedTuple):
 def check_tissue(scenario: Scenario, phantom: PhantomModel) -> None:
     """Raise UserError if the default tissue could not be stepped on this phantom's mesh."""
     from palpate_bus.contract import contract
-    from palpate_bus.messages.stamps import NS
+    from palpate_bus.messages import NS
     from palpate_tissue.backends.winkler.mechanics import assemble
 
     if scenario.services.tissue == "winkler":

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, Message
 from palpate_bus.messages.geometry import vector
-from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC

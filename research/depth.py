@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, codec
 from palpate_bus.recordings import open_recording
 from palpate_models.numerics.frames import Array
 from palpate_validation.check import COLOURS, write_figure

@@ -10,8 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages import CameraTrigger, RobotStatus, SurfaceMesh, SurfaceMotion, TFMessage, Vector3, Wrench
-from palpate_bus.messages.stamps import MS, NS, header, nanoseconds
+from palpate_bus.messages import (
+    MS,
+    NS,
+    CameraTrigger,
+    RobotStatus,
+    SurfaceMesh,
+    SurfaceMotion,
+    TFMessage,
+    Vector3,
+    Wrench,
+    header,
+    nanoseconds,
+)
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.numerics.frames import Array, apply, inverse, matrix

@@ -10,8 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, codec, nanoseconds
 from palpate_bus.recordings import open_recording
 
 TOPIC = "truth/indentation"

@@ -16,8 +16,8 @@ from palpate_benchmarks.liar import Lie, LyingTopic
 from palpate_benchmarks.lies import LIES, MOMENTS, cases, moments_of
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
-from palpate_bus.messages.codec import Message, decoder
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, Message
+from palpate_bus.messages.codec import decoder
 from palpate_bus.recordings import Recording, open_recording
 
 

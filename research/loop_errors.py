@@ -30,9 +30,8 @@ from palpate.report.evidence import points
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_assessment.service import SEEN, skin_of
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import NS, ExamState, nanoseconds
 from palpate_bus.messages.geometry import vectors
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.breathing import BreathingCurve

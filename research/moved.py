@@ -13,9 +13,8 @@ import typer
 
 from palpate.report.archive import FILE, EvidenceError, read_evidence
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import NS, ExamState, nanoseconds
 from palpate_bus.messages.codec import decode
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.motion import BodyMotion

@@ -26,7 +26,7 @@ from palpate.report.results import Known, truth_of_run
 from palpate.report.rows import Scores, finding_rows
 from palpate.report.scoring import score
 from palpate.run.composed import load_services
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected

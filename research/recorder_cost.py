@@ -14,6 +14,7 @@ from mcap.writer import CompressionType
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import (
+    MS,
     Duration,
     JointState,
     JointTorqueCommand,
@@ -27,8 +28,8 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
     codec,
+    header,
 )
-from palpate_bus.messages.stamps import MS, header
 from palpate_recorder.bag import BagWriter
 from palpate_recorder.service import channels
 

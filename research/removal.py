@@ -22,8 +22,7 @@ from rich.table import Table
 
 from palpate.run.composed import load_services
 from palpate.run.roles import WORKERS
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS, codec
 from palpate_bus.runtime.composed import Composed
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_models.scenario.load import exam_input, load_scenario

@@ -18,8 +18,7 @@ from palpate.report.rows import Scores, finding_rows
 from palpate.report.scoring import Truth, score
 from palpate.truth.pressed import Touched, TrueBody, press_patient
 from palpate_assessment.service import AssessmentService
-from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3, header
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.field import gaussian_field
 from palpate_models.patient.phantom import PhantomModel, build_phantom

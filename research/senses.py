@@ -21,9 +21,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
+from palpate_bus.messages import NS, codec, nanoseconds
 from palpate_bus.messages.geometry import wrench
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario

@@ -17,9 +17,9 @@ from palpate_bus.messages import (
     Quaternion,
     StiffnessMap,
     Vector3,
+    header,
 )
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult

@@ -24,8 +24,7 @@ from palpate.run.roles import check_choices, settings_of
 from palpate.study.statistics.reading import read_tables
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import MS, JointState, codec, header
 from palpate_bus.runtime.lockstep import Stepper
 from palpate_bus.settings import Settings, variable
 from palpate_models.patient.phantom import build_phantom

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_bus.messages import CameraTrigger
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import MS, CameraTrigger, header
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService
 from palpate_models.numerics.frames import look_at

@@ -20,8 +20,18 @@ import zenoh
 from toy_runs import APART, LOOP, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services, with_own_process
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.messages import DiagnosticStatus, JointTorqueCommand, RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import MS, NS, duration_message, nanoseconds, time_message
+from palpate_bus.messages import (
+    MS,
+    NS,
+    DiagnosticStatus,
+    JointTorqueCommand,
+    RunControl,
+    ServiceReport,
+    codec,
+    duration_message,
+    nanoseconds,
+    time_message,
+)
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode

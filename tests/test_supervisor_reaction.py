@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.run.composed import load_services
-from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.messages import NS, ExamState, OperatorRequest, RobotStatus, SupervisorState, header, nanoseconds
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.collector import Collector

@@ -15,7 +15,7 @@ from unittest import mock
 import zenoh
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session

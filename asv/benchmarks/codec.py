@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages import Image, JointState, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import Image, JointState, codec, header
 
 
 def example(name: str) -> tuple[str, Any]:

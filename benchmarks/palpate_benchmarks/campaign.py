@@ -29,8 +29,7 @@ from palpate_benchmarks.fault_cases import MESSAGE_KINDS, PROCESS_KINDS, SCARCE_
 from palpate_benchmarks.faulty import InjectedFault, command
 from palpate_benchmarks.injection import CONDUCTOR, ROLES, FaultLog, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, ExamState, RobotStatus, SupervisorState, nanoseconds
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode

@@ -27,8 +27,7 @@ from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, TEST, measure
 from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
-from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, ExamState, RobotStatus, SupervisorState
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import Collected

@@ -30,9 +30,8 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create as create_service
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, Message, nanoseconds, time_message
 from palpate_bus.messages.fields import numbers
-from palpate_bus.messages.stamps import NS, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.scenario.schema import Services
 

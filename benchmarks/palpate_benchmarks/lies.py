@@ -24,9 +24,8 @@ from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, CaseResult,
 from palpate_benchmarks.injection import FaultLog, examination, signs_of, sustained_rate
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import MS, NS, ExamState, nanoseconds
 from palpate_bus.messages.fields import leaves
-from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree

@@ -17,7 +17,7 @@ from mcap.stream_reader import StreamReader
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.mcap_records import BROKEN, RecordingError, open_file
-from palpate_bus.messages.stamps import UNIX_NS
+from palpate_bus.messages import UNIX_NS
 from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import KEPT_EVERY, RECORDING
 from palpate_errors import UserError

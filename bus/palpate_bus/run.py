@@ -18,7 +18,7 @@ import zenoh
 
 from palpate_bus.contract import Role, contract
 from palpate_bus.implementations import create
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member

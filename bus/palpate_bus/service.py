@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, Protocol
 
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message
 
 Outbox = Mapping[str, "Message | list[Message]"]
 """Messages by topic: one, or a list for an event topic. They must not be changed after the step, since readers in the same

@@ -6,9 +6,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import ImpedanceSetpoint
+from palpate_bus.messages import ImpedanceSetpoint, duration_message, header, nanoseconds
 from palpate_bus.messages.geometry import Array, pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
-from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 
 TOPIC = "planning/setpoint"
 

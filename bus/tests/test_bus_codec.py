@@ -7,8 +7,7 @@ from message_strategies import messages
 from message_stubs import STUB, stub
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec, duration_message, header
 from palpate_bus.messages.typestore import palpation_definitions
 
 TYPES = sorted(

@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from toy_services import TOYS
 
 from palpate_bus.contract import Edge, contract
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS
 from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Stepper
 
 TOPICS = contract().topics

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import Image, Quaternion
+from palpate_bus.messages import Image, Quaternion, header, nanoseconds
 from palpate_bus.messages.geometry import (
     depth_in_metres,
     depth_message,
@@ -27,7 +27,6 @@ from palpate_bus.messages.geometry import (
     wrench,
     wrench_message,
 )
-from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 
 

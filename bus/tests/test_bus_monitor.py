@@ -12,6 +12,7 @@ from message_strategies import messages
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import (
+    MS,
     DiagnosticArray,
     DiagnosticStatus,
     JointState,
@@ -21,9 +22,10 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
     codec,
+    duration_message,
+    header,
 )  # fmt: skip
 from palpate_bus.messages.fields import leaves, numbers
-from palpate_bus.messages.stamps import MS, duration_message, header
 from palpate_bus.monitor.health import RECENT_S, Violation, topic_statuses
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.messages import JointState, RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import MS, JointState, RunControl, ServiceReport, codec, header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
 from palpate_bus.runtime.observer import RecorderNode
 from palpate_bus.runtime.output import ChunkMessage, ChunkWriter, unpack_chunk

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import Edge, contract
-from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import JointState, codec, header
 from palpate_bus.run import in_background
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import OperatorRequest, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import OperatorRequest, codec, header
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire import rmw
 from palpate_bus.wire.rmw import KEY_SIZE, TAG_SIZE, AttachmentWriter, Tagger, make_key, read_key

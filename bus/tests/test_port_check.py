@@ -13,6 +13,8 @@ from toy_services import TOYS, Robot
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, PortCheck, RefusedMessage
 from palpate_bus.messages import (
+    MS,
+    NS,
     Duration,
     ImpedanceSetpoint,
     JointTorqueCommand,
@@ -25,8 +27,9 @@ from palpate_bus.messages import (
     Vector3,
     Wrench,
     codec,
+    header,
+    nanoseconds,
 )
-from palpate_bus.messages.stamps import MS, NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import Packet, Stepper

@@ -15,6 +15,8 @@ import numpy as np
 import zenoh
 
 from palpate_bus.messages import (
+    MS,
+    NS,
     CameraTrigger,
     Image,
     ImpedanceSetpoint,
@@ -35,9 +37,11 @@ from palpate_bus.messages import (
     Vector3,
     Wrench,
     WrenchStamped,
+    blank,
+    duration_message,
+    header,
 )
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import MS, NS, blank, duration_message, header
 from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings

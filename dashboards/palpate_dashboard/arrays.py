@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from palpate_bus.messages import Transform
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message, Transform
 from palpate_models.numerics.frames import Array
 
 Floats = NDArray[np.floating[Any]]

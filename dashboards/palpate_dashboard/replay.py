@@ -19,8 +19,7 @@ from mcap.records import Channel, Message as McapMessage, Schema
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.mcap_records import BROKEN, RecordingError, complete_records
-from palpate_bus.messages import RunControl, codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, RunControl, codec
 from palpate_bus.recordings import recorded_type
 from palpate_bus.runs.announcement import Run, live_runs
 from palpate_bus.runs.operator import OperatorKeys, order

@@ -12,7 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message
 from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame, quaternion, transform_matrix, vectors
 from palpate_dashboard import palette
 from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, transform, triples

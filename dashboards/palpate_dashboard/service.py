@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import MS, Message, RobotStatus, StiffnessMap, SurfaceMotion, nanoseconds
 from palpate_bus.messages.geometry import pose_matrix, vectors
-from palpate_bus.messages.stamps import MS, nanoseconds
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings

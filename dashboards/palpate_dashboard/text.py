@@ -9,8 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import ExamState, StiffnessMap
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import ExamState, Message, StiffnessMap
 from palpate_inputs import printable
 
 LEVELS = ("ok", "warning", "ERROR", "stale")

@@ -31,6 +31,8 @@ from palpate_bus.messages import (
     StiffnessMap,
     Vector3,
     codec,
+    header,
+    time_message,
 )
 from palpate_bus.messages.geometry import (
     camera_info,
@@ -41,7 +43,6 @@ from palpate_bus.messages.geometry import (
     point_message,
     wrench_message,
 )
-from palpate_bus.messages.stamps import header, time_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr

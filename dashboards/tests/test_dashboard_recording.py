@@ -11,8 +11,7 @@ import rerun as rr
 from dashboard_messages import OBSERVED, FakeInbox, Messages, latched, run, write_recording
 from rerun.chunk import RrdReader
 
-from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, header
 from palpate_dashboard import replay
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import AWAITED

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Finding, Findings, Point
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import ExamState, Finding, Findings, Point, header
 from palpate_bus.service import Service
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input

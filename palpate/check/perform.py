@@ -22,9 +22,7 @@ from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
 from palpate.live.topic import every_sender
 from palpate_bus import implementations
-from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import MS, NS
+from palpate_bus.messages import MS, NS, Message, RunControl, ServiceReport, codec
 from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
 from palpate_bus.runtime.member import Member

@@ -14,9 +14,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import RefusedMessage
-from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import MS, Message, RobotStatus, Vector3, Wrench, codec, header
 from palpate_bus.runtime.lockstep import Outgoing, Packet, Stepper
 from palpate_bus.service import Service
 from palpate_models.scenario.schema import Scenario

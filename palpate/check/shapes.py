@@ -5,9 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 
 CURVATURE_PER_M = 2.0

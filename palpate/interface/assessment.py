@@ -29,9 +29,8 @@ from palpate.report.rows import FindingRow, finding_rows
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
 from palpate.run.roles import foreign_roles
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import NS, ExamState, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.numerics.maps import half_width

@@ -18,8 +18,7 @@ from palpate.console import bandwidth, print_json, print_line, say, table, wide_
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
 from palpate_bus.contract import Topic, contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages import codec, nanoseconds
 from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.wire.liveliness import Entity, EntityKind
 from palpate_bus.wire.rmw import parse_key, topic_key

@@ -17,10 +17,8 @@ from palpate.report.results import assemble, truth_of_run
 from palpate.report.rows import Report
 from palpate.run.composed import load_services
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, codec
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, ExamState, IndentationTruth, Message, PhantomTruth, Point, codec, header, nanoseconds
 from palpate_bus.messages.geometry import mesh_message, pose_message
-from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox

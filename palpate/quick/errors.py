@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 
 from palpate.quick.patient import PERIOD_S
 from palpate_bus.contract import contract
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator

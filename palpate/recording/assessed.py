@@ -12,9 +12,8 @@ from palpate_assessment.grid import map_grid
 from palpate_assessment.places import places_of
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import NS, ExamState, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
 from palpate_models.scenario.schema import Exam
 

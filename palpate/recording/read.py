@@ -19,7 +19,7 @@ from palpate.recording.timed import contacts_over_time
 from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import columns_of, points, xyz
 from palpate_assessment.calibration import load_calibration
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, nanoseconds
 from palpate_models.numerics.frames import Array, apply, inverse, matrix
 from palpate_models.scenario.load import exam_input, load_scenario
 

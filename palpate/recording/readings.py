@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from palpate.recording.mapping import SCALES, Joints, MappedColumns, Mapping, Topics, Transform
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
 from palpate_errors import UserError

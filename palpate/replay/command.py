@@ -43,7 +43,7 @@ def replay(  # noqa: PLR0913 - the options of a command
     from palpate.console import refuse
     from palpate.replay.golden import run_again, write_reference
     from palpate.replay.play import play
-    from palpate_bus.messages.stamps import NS
+    from palpate_bus.messages import NS
 
     played: dict[str, object] = {"--topic": topics, "--listen": listen, "--hold": hold, "--drive": drive, "--rate": rate != 1.0}
     compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}

@@ -11,8 +11,7 @@ from rich.table import Table
 
 from palpate.console import table
 from palpate_bus.contract import Contract, Topic, contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, codec
 from palpate_bus.recordings import RecordedMessage
 from palpate_plugins import PluginError
 

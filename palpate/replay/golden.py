@@ -23,8 +23,7 @@ from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, par
 from palpate_bus import implementations
 from palpate_bus.contract import Contract, Edge, Topic, contract
 from palpate_bus.mcap_records import RecordingError
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import MS, nanoseconds, time_message
+from palpate_bus.messages import MS, codec, nanoseconds, time_message
 from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording, open_recording
 from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.service import Service

@@ -9,8 +9,7 @@ from typing import Final, NamedTuple, Self
 
 from palpate.console import SteadyConsole, TimeLeft
 from palpate_bus.contract import Contract, contract
-from palpate_bus.messages import Clock, codec
-from palpate_bus.messages.stamps import MS, NS, time_message
+from palpate_bus.messages import MS, NS, Clock, codec, time_message
 from palpate_bus.recordings import Recording, open_recording
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings

@@ -23,8 +23,7 @@ from palpate.replay.golden import rerun, write_recording
 from palpate.truth.pressed import Pressed, Touched
 from palpate_bus.contract import contract
 from palpate_bus.mcap_records import BROKEN, RecordingError
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, codec, nanoseconds
 from palpate_bus.recordings import RecordedMessage, Recording, open_recording
 from palpate_bus.runs.announcement import live_runs
 from palpate_bus.runs.run_folder import in_use

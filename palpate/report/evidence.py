@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from palpate.report.scoring import Map, Truth
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
-from palpate_bus.messages import StiffnessMap
+from palpate_bus.messages import NS, StiffnessMap, nanoseconds
 from palpate_bus.messages.geometry import pose_matrix
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input

@@ -23,9 +23,8 @@ from palpate_assessment.service import AssessmentService
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create
 from palpate_bus.mcap_records import RecordingError
-from palpate_bus.messages import ExamState, codec
+from palpate_bus.messages import NS, ExamState, codec, nanoseconds
 from palpate_bus.messages.geometry import vector
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import RecordedMessage
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.settings import variable

@@ -14,7 +14,7 @@ from palpate.run.interrupts import all_is_measured
 from palpate.run.roles import OBSERVERS, choice, foreign_roles, read_record, workers, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_bus.runtime.composed import NO_ROLE, Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.observer import RawRecorder

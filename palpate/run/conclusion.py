@@ -17,8 +17,7 @@ from palpate.run.folder import another_folder, megabytes_of
 from palpate.run.roles import write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import ExamState, RobotStatus
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages import NS, ExamState, RobotStatus, nanoseconds
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunResult

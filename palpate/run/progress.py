@@ -8,8 +8,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn
 from rich.text import Text
 
 from palpate.run.inputs import Outlook, duration_text
-from palpate_bus.messages import ExamState
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, ExamState
 from palpate_bus.runs.operator import HINT, WORDS, OperatorKeys
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam, Mode

@@ -14,8 +14,7 @@ from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, c
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch, examination
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, JointTorqueCommand, codec
-from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
+from palpate_bus.messages import NS, ExamState, JointTorqueCommand, codec, duration_message, header, nanoseconds
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.rmw import topic_key

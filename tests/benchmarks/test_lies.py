@@ -14,7 +14,7 @@ from palpate_benchmarks.injection import FaultLog
 from palpate_benchmarks.liar import KINDS, Liar, Lie
 from palpate_benchmarks.lies import Healthy, cases, cells, judge, left_out, run_lies
 from palpate_bus.contract import Edge, contract
-from palpate_bus.messages.stamps import MS, NS, nanoseconds
+from palpate_bus.messages import MS, NS, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import Stepper
 

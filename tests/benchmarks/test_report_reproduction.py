@@ -14,7 +14,7 @@ from PIL import Image
 from palpate.exam_state import exam_state
 from palpate.report.archive import Evidence, read_completed, write_evidence
 from palpate.truth.pressed import Touched
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
 from palpate_reproduction.page import choose_moments

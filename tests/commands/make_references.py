@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from palpate.replay.golden import make_reference, prepare
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 
 FOLDER = Path(__file__).parent / "references"
 SETTINGS = (

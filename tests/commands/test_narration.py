@@ -13,8 +13,7 @@ from rich.console import Console
 from palpate.exam_state import exam_state
 from palpate.run.inputs import Outlook
 from palpate.run.progress import PHASES, Narration, RunDisplay
-from palpate_bus.messages import ExamState, OperatorRequest
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, ExamState, OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam

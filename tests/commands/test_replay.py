@@ -19,8 +19,7 @@ from palpate.replay.compare import Tolerance, compare
 from palpate.replay.golden import prepare, replay_service, rerun
 from palpate.replay.play import Player
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages import codec, nanoseconds
 from palpate_bus.recordings import RecordedMessage, open_recording
 from palpate_bus.wire.liveliness import GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import topic_key, unpack

@@ -18,8 +18,7 @@ from palpate.report.results import Known, assemble, clean_world, print_findings,
 from palpate.report.rows import Report
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
-from palpate_bus.messages import ExamState, RobotStatus
-from palpate_bus.messages.stamps import blank
+from palpate_bus.messages import ExamState, RobotStatus, blank
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import gave_up

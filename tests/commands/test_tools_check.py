@@ -14,8 +14,7 @@ from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import SUITES, check
 from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, kind
-from palpate_bus.messages import Point, Pose, SupervisorState
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, Point, Pose, SupervisorState
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import load_scenario

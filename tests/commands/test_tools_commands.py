@@ -22,8 +22,7 @@ from palpate.live.doctor import doctor
 from palpate.live.graph import app as node, missing
 from palpate.live.topic import app as topic
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, String, Vector3, Wrench, WrenchStamped, codec
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import MS, JointState, String, Vector3, Wrench, WrenchStamped, codec, header
 from palpate_bus.runs.announcement import Announcement, Run, live_runs
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import topic_key

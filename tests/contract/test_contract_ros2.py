@@ -19,8 +19,7 @@ from palpate.check.rig import RigSettings
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet
 from palpate_bus.contract import contract
-from palpate_bus.messages import CameraTrigger, Image, JointState, Vector3, Wrench, WrenchStamped, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import CameraTrigger, Image, JointState, Vector3, Wrench, WrenchStamped, codec, header
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher

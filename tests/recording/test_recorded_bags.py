@@ -16,6 +16,7 @@ from palpate.recording.read import read_recording
 from palpate.recording.readings import ReadingError
 from palpate.recording.recording import Contact, ContactKind, loading
 from palpate_bus.messages import (
+    NS,
     JointState,
     Point,
     Pose,
@@ -27,8 +28,8 @@ from palpate_bus.messages import (
     Vector3,
     Wrench,
     WrenchStamped,
+    header,
 )
-from palpate_bus.messages.stamps import NS, header
 from palpate_bus.messages.typestore import store
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from research import stability
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, BusDelay, DelayedInbox, Delays, press
 from research.loop_theory import admittance_gain, linearise

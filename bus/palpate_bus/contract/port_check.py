@@ -26,9 +26,9 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract.rows import Topic
-from palpate_bus.messages.codec import Message, message_type, store
+from palpate_bus.messages import Message, nanoseconds
+from palpate_bus.messages.codec import message_type, store
 from palpate_bus.messages.fields import LeafField, leaves, numbers
-from palpate_bus.messages.stamps import nanoseconds
 from palpate_errors import RunError
 
 

@@ -14,8 +14,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from palpate_bus.messages import codec
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS, codec
 from palpate_bus.settings import Settings
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

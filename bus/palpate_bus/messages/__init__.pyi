@@ -6,6 +6,18 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_bus.messages.codec import CodecError as CodecError, Message as Message
+from palpate_bus.messages.stamps import (
+    MS as MS,
+    NS as NS,
+    UNIX_NS as UNIX_NS,
+    blank as blank,
+    duration_message as duration_message,
+    header as header,
+    nanoseconds as nanoseconds,
+    time_message as time_message,
+)
+
 @dataclass
 class Duration:
     __msgtype__: ClassVar[str]

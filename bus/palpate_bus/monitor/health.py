@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.contract.port_check import MessageViolation, ViolationKind as Kind
-from palpate_bus.messages import DiagnosticStatus, KeyValue, codec
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS, DiagnosticStatus, KeyValue, codec
 
 
 class Violation(NamedTuple):

@@ -22,8 +22,7 @@ import zenoh
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
-from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import MS, UNIX_NS
+from palpate_bus.messages import MS, UNIX_NS, RunControl, ServiceReport, codec
 from palpate_bus.monitor import health
 from palpate_bus.monitor.health import BusTime, SeenViolation, Stream, TopicHealth, Violation
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch

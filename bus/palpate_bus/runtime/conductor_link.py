@@ -11,8 +11,7 @@ from time import monotonic
 from typing import Any, Final, NamedTuple
 
 from palpate_bus.contract import Contract
-from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, RunControl, ServiceReport, codec
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import is_running, pid_space
 from palpate_bus.settings import Settings

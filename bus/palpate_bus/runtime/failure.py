@@ -10,7 +10,7 @@ from traceback import walk_tb
 from typing import Any, NamedTuple
 
 from palpate_bus.contract.port_check import Checker, RefusedMessage
-from palpate_bus.messages.codec import CodecError, Message
+from palpate_bus.messages import CodecError, Message
 from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, LockstepError, Packet
 from palpate_plugins import USER_MODULE
 

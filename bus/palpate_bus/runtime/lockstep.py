@@ -16,8 +16,7 @@ from time import perf_counter_ns
 
 from palpate_bus.contract import Contract, Edge, Topic
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
-from palpate_bus.messages import codec
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message, codec
 from palpate_bus.service import Outbox, Service
 from palpate_errors import RunError
 

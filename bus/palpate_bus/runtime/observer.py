@@ -15,8 +15,7 @@ import zenoh
 
 from palpate_bus.contract import Topic
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
-from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages import RunControl, ServiceReport, codec, nanoseconds
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Packet, Stepper
 from palpate_bus.runtime.member import Member

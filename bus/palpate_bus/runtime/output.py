@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages import RecordChunk, codec
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS, RecordChunk, codec
 from palpate_bus.runtime.lockstep import Outgoing
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import psutil
 
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS
 
 GC_THRESHOLD = 100_000
 """New objects before a garbage collection. Messages form no cycles: a run of 50 s leaves 2000 objects in cycles."""

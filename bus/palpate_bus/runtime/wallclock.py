@@ -19,9 +19,7 @@ import numpy as np
 
 from palpate_bus.contract import Edge, Topic, Visibility
 from palpate_bus.contract.port_check import RefusedMessage
-from palpate_bus.messages import RunControl, ServiceReport
-from palpate_bus.messages.codec import CodecError
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS, CodecError, RunControl, ServiceReport
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Outgoing, Packet, Stepper
 from palpate_bus.runtime.member import Member

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import zenoh
 
 from palpate_bus.contract import Qos, Topic, contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.codec import CodecError
+from palpate_bus.messages import CodecError, codec
 from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import AttachmentWriter, Tagger, WireError, hello_key, parse_key, read_key, unpack
 

@@ -12,7 +12,7 @@ import numpy as np
 from palpate.check.rig import ConformanceReport, ReceivedMessage, Rig
 from palpate_bus.contract import Topic
 from palpate_bus.contract.port_check import Checker
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS
 
 SUITES = {
     "robot": 9.0, "tissue": 4.0, "control": 7.0, "planning": 2.0, "camera": 2.5, "perception": 4.5, "assessment": 31.0,

@@ -7,9 +7,8 @@ import numpy as np
 from palpate.check import shapes
 from palpate.check.rig import Rig, sense
 from palpate.exam_state import exam_state
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import MS, ExamState, header
 from palpate_bus.messages.geometry import mesh_message, vectors
-from palpate_bus.messages.stamps import MS, header
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.scenario.load import exam_input
 

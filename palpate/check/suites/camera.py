@@ -6,9 +6,8 @@ import numpy as np
 
 from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
-from palpate_bus.messages import CameraTrigger
+from palpate_bus.messages import MS, CameraTrigger, header, nanoseconds
 from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame
-from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_models.numerics.frames import Array
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"

@@ -5,8 +5,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from palpate.check.rig import Feed, ReceivedMessage, Rig, robot_status
-from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus
-from palpate_bus.messages.stamps import MS, header, nanoseconds
+from palpate_bus.messages import MS, ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.chain import Arm

@@ -6,9 +6,7 @@ import numpy as np
 
 from palpate.check.rig import Rig
 from palpate.exam_state import exam_state
-from palpate_bus.messages import ExamState, PalpationSample, Point, SearchRequest, Vector3
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import ExamState, Message, PalpationSample, Point, SearchRequest, Vector3, header
 
 REQUEST: Final = "exam/request"
 PRESS_S: Final = 0.3

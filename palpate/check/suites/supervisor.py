@@ -8,8 +8,7 @@ import pinocchio as pin
 from palpate.check.rig import Feed, ReceivedMessage, Rig, robot_status
 from palpate.check.shapes import level
 from palpate.exam_state import exam_state
-from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import MS, NS, header
+from palpate_bus.messages import MS, NS, ExamState, OperatorRequest, RobotStatus, SupervisorState, header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
 from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose

@@ -5,9 +5,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from palpate.check.rig import Feed, ReceivedMessage, Rig
-from palpate_bus.messages import Pose, Quaternion, ToolState, Twist, Vector3
+from palpate_bus.messages import Pose, Quaternion, ToolState, Twist, Vector3, header
 from palpate_bus.messages.geometry import mesh_arrays, point_message, pose_matrix, rotation, vector, vector_message
-from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 
 WRENCH = "sim/contact_wrench"

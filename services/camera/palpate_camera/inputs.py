@@ -8,8 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import Transform
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message, Transform
 from palpate_bus.messages.geometry import MAX_DEPTH_M, depth_in_metres, transform_matrix, transform_message
 from palpate_camera.messages import Pinhole
 from palpate_errors import UserError

@@ -11,9 +11,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import Message, header
 from palpate_bus.messages.geometry import camera_info, depth_message
-from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Camera
 

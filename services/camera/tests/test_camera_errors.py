@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.messages import CameraTrigger
+from palpate_bus.messages import MS, CameraTrigger, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.errors import (
     BASELINE_M,

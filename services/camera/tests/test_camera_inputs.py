@@ -10,6 +10,7 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import (
+    MS,
     CameraTrigger,
     Image,
     Quaternion,
@@ -18,10 +19,10 @@ from palpate_bus.messages import (
     Transform,
     TransformStamped,
     Vector3,
+    header,
 )
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.geometry import camera_info, transform_matrix
-from palpate_bus.messages.stamps import MS, header
 from palpate_bus.recordings import open_recording
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox

@@ -15,9 +15,8 @@ from palpate.perceive import perceive_recording, write
 from palpate.run.roles import check_choices
 from palpate_bus.contract import contract
 from palpate_bus.mcap_records import RecordingError
-from palpate_bus.messages import CameraTrigger
+from palpate_bus.messages import MS, CameraTrigger, header, nanoseconds, time_message
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.stamps import MS, header, nanoseconds, time_message
 from palpate_bus.recordings import open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
 from palpate_camera.backends.replay import POSE, ReplayedCamera, create

@@ -10,9 +10,19 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import CameraTrigger, Image, Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages import (
+    MS,
+    CameraTrigger,
+    Image,
+    Quaternion,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    Vector3,
+    header,
+    nanoseconds,
+)
 from palpate_bus.messages.geometry import camera_info
-from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions

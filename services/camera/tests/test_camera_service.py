@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from palpate_bus.messages import CameraTrigger, TFMessage
+from palpate_bus.messages import MS, CameraTrigger, TFMessage, header, nanoseconds
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.scene import Mesh, Scene
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform

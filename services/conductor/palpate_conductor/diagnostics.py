@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from palpate_bus.contract import Contract
-from palpate_bus.messages import DiagnosticStatus, KeyValue
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, DiagnosticStatus, KeyValue
 from palpate_bus.monitor.health import RECENT_S, SeenViolation, topic_statuses
 from palpate_bus.monitor.monitor import LiveMonitor
 from palpate_bus.security.access import WATCHER, list_watched

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from time import monotonic, time_ns
 from typing import Final, NamedTuple
 
-from palpate_bus.messages.stamps import MS, NS
+from palpate_bus.messages import MS, NS
 from palpate_bus.runs.operator import TIME_REQUESTS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER

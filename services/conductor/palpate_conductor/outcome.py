@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from palpate_bus.messages import ExamState
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, ExamState
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_errors import RunError

@@ -14,8 +14,7 @@ from typing import Any, Final, NamedTuple
 import psutil
 
 from palpate_bus.contract import Contract
-from palpate_bus.messages import RunControl, codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, RunControl, codec
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT, longest_silence_s
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import Activity, is_running, pid_space

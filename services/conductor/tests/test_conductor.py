@@ -13,8 +13,7 @@ import pytest
 
 from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, IndentationTruth, Point, SupervisorState
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages import NS, ExamState, IndentationTruth, Point, SupervisorState, header
 from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER

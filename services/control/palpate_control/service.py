@@ -8,10 +8,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointTorqueCommand, RobotStatus, codec
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import MS, NS, JointTorqueCommand, Message, RobotStatus, codec, duration_message, header, nanoseconds
 from palpate_bus.messages.geometry import wrench
-from palpate_bus.messages.stamps import MS, NS, duration_message, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_control.admittance import AdmittanceController

@@ -6,8 +6,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus
-from palpate_bus.messages.stamps import MS, blank, duration_message, header, nanoseconds
+from palpate_bus.messages import (
+    MS,
+    ImpedanceSetpoint,
+    JointState,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    blank,
+    duration_message,
+    header,
+    nanoseconds,
+)
 from palpate_bus.testing import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create

@@ -8,9 +8,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import PalpationTargets, SurfaceCorrection, SurfaceMotion, geometry
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.messages import NS, Message, PalpationTargets, SurfaceCorrection, SurfaceMotion, geometry, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_bus.messages import CameraTrigger, SurfaceMotion, TFMessage
+from palpate_bus.messages import MS, CameraTrigger, SurfaceMotion, TFMessage, header, nanoseconds
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.numerics.frames import apply, inverse, matrix

@@ -9,9 +9,19 @@ from planning_fakes import BASE, World, known
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import Findings, OperatorRequest, PalpationTargets, RobotStatus, SupervisorState, Vector3, codec
+from palpate_bus.messages import (
+    MS,
+    Findings,
+    OperatorRequest,
+    PalpationTargets,
+    RobotStatus,
+    SupervisorState,
+    Vector3,
+    codec,
+    header,
+    nanoseconds,
+)
 from palpate_bus.messages.geometry import mesh_message, point_message, wrench_message
-from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr

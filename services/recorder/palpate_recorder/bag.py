@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from palpate_bus.messages.stamps import MS
+from palpate_bus.messages import MS
 from palpate_bus.settings import KEPT_EVERY
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from mcap.records import Channel as ChannelRecord, Message, Schema
 
 from palpate_bus.mcap_records import Gap, complete_records
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_bus.recordings import RecordedMessage, RecordedType, Recording, kept_every_ms, recorded_type
 from palpate_inputs import InputError, parse_yaml
 from palpate_recorder.bag import BagWriter, Channel

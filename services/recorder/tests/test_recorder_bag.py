@@ -18,9 +18,8 @@ from rosbags.rosbag2 import Reader
 
 from palpate_bus.contract import contract
 from palpate_bus.mcap_records import Gap, RecordingError, complete_records
-from palpate_bus.messages import JointState, codec
+from palpate_bus.messages import JointState, codec, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import open_recording
 from palpate_bus.settings import RECORDING
 from palpate_models.scenario.schema import Scenario

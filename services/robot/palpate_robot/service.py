@@ -7,10 +7,8 @@ from zlib import crc32
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import Header, JointState, RobotStatus, String, Time, Vector3, Wrench, WrenchStamped
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, Header, JointState, Message, RobotStatus, String, Time, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
-from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, link_names, urdf

@@ -4,9 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_bus.messages import OperatorRequest, SupervisorState
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages import Message, OperatorRequest, SupervisorState, nanoseconds
 from palpate_bus.service import Inbox
 from palpate_robot.driver import Command, Driver, HoldCause
 

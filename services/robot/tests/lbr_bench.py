@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages import JointTorqueCommand, RobotStatus
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_message, header
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel

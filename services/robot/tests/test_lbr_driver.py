@@ -8,8 +8,7 @@ from lbr_bench import MS, SCENARIO, Rig, active_rig
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck
-from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, header, nanoseconds
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
 from palpate_robot.backends.hardware import GravityModel

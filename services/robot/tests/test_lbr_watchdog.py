@@ -12,8 +12,7 @@ import pytest
 from lbr_bench import MS, Rig, active_rig, driver_on_emulator
 
 from palpate.run.composed import load_services
-from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages import ExamState, RobotStatus, SupervisorState, header, nanoseconds
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import contract
+from palpate_bus.messages import duration_message, header
 from palpate_bus.messages.codec import encode, message_type
-from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.messages import JointTorqueCommand, RobotStatus
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_message, header
 from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
 from palpate_models.robot.urdf_arm import load_arm

@@ -8,9 +8,7 @@ from numpy.typing import ArrayLike
 
 from palpate_assessment.shapes import Bump
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, Point, SearchRequest
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.messages import NS, ExamState, Message, Point, SearchRequest, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input

@@ -11,10 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import Point, ToolState, WrenchStamped
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, Message, Point, ToolState, WrenchStamped
 from palpate_bus.messages.geometry import pose_matrix, pose_message, twist, twist_message, vector, wrench, wrench_message
-from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import Array, inverse, matrix
 from palpate_models.patient.motion import BodyMotion

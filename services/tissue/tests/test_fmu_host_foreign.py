@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 from tissue_messages import Source, pose, tool_state
 
 from palpate_bus.contract import Contract, contract, parse
-from palpate_bus.messages import PoseStamped
+from palpate_bus.messages import MS, NS, PoseStamped, header
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import vectors
-from palpate_bus.messages.stamps import MS, NS, header
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.testing import HandInbox
 from palpate_fmu.compiling import native

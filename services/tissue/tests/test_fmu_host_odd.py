@@ -9,7 +9,7 @@ from odd_fmu import Odd, build_wall, description
 from tissue_messages import Source
 
 from palpate_bus.contract import Contract, parse
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.reading import FmuError

@@ -11,8 +11,8 @@ from tissue_messages import tool_state
 
 from palpate_bus.contract import contract
 from palpate_bus.implementations import kind
+from palpate_bus.messages import MS
 from palpate_bus.messages.codec import decode, encode
-from palpate_bus.messages.stamps import MS
 from palpate_bus.testing import HandInbox
 from palpate_models.patient import wall
 from palpate_models.patient.phantom import PhantomModel, flat_phantom

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from tissue_messages import tool_state
 
-from palpate_bus.messages import ToolState
+from palpate_bus.messages import MS, ToolState
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import pose_matrix
-from palpate_bus.messages.stamps import MS
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import apply, matrix

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion, ToolState, Twist, Vector3
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion, ToolState, Twist, Vector3, header
 from palpate_bus.service import Inbox, Outbox, Service
 
 ZERO = (0.0, 0.0, 0.0)

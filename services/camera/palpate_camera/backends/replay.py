@@ -14,10 +14,9 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 from palpate_bus.contract import contract
 from palpate_bus.mcap_records import RecordingError
-from palpate_bus.messages import TFMessage, TransformStamped
-from palpate_bus.messages.codec import CodecError, Message, decode
+from palpate_bus.messages import CodecError, Message, TFMessage, TransformStamped, header, nanoseconds
+from palpate_bus.messages.codec import decode
 from palpate_bus.messages.geometry import transform_matrix
-from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.recordings import RecordedMessage, Recording, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages

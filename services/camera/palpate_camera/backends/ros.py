@@ -4,8 +4,7 @@ from collections.abc import Callable, Mapping
 from time import monotonic, sleep, time_ns
 from typing import Any, ClassVar, Final, NamedTuple
 
-from palpate_bus.messages import TFMessage, Transform, TransformStamped
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages import TFMessage, Transform, TransformStamped, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode

@@ -12,9 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages import WrenchStamped
+from palpate_bus.messages import WrenchStamped, header
 from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
-from palpate_bus.messages.stamps import header
 from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import catch_signals

@@ -15,10 +15,8 @@ import pinocchio as pin
 
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, RobotStatus, String, WrenchStamped
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import JointState, Message, RobotStatus, String, WrenchStamped, header
 from palpate_bus.messages.geometry import wrench, wrench_message
-from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, urdf

@@ -6,10 +6,8 @@ from zlib import crc32
 
 import numpy as np
 
-from palpate_bus.messages import TFMessage, TransformStamped
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import NS, Message, TFMessage, TransformStamped, header
 from palpate_bus.messages.geometry import transform_matrix, transform_message
-from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
 from palpate_camera.backends.kinect import scene

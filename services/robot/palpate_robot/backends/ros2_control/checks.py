@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS
 from palpate_models.numerics.frames import Array
 
 

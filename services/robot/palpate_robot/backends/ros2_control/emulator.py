@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import MS, NS, header
+from palpate_bus.messages import MS, NS, JointState, codec, header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError

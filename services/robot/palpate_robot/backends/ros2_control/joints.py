@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages.stamps import nanoseconds
+from palpate_bus.messages import nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
 from palpate_robot.backends.hardware import STATE_AGE_NS, MeasuredArm

@@ -4,9 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages import codec
+from palpate_bus.messages import codec, header
 from palpate_bus.messages.geometry import pose_message
-from palpate_bus.messages.stamps import header
 from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import TOOL, arm_of

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import Contract, contract as default_contract
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages import NS, Message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_errors import RunError, UserError
 from palpate_fmu.compiling import native

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import Contract, Topic
-from palpate_bus.messages.codec import CodecError, Message
+from palpate_bus.messages import NS, CodecError, Message, blank
 from palpate_bus.messages.fields import LeafField, leaves, numbers
-from palpate_bus.messages.stamps import NS, blank
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
