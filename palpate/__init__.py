@@ -9,8 +9,6 @@
 Nothing is imported before it is used, so that `import palpate` takes no time.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from types import ModuleType

@@ -22,7 +22,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import sleep
-from typing import Final
 
 import numpy as np
 import zenoh
@@ -35,8 +34,8 @@ from palpate_bus.run import load_service, run_service
 from palpate_bus.wire.transport import Sender, Transport
 from palpate_models.scenario.load import load_scenario
 
-PAST_S: Final = 3600
-JUMP_NS: Final = 3600 * NS
+PAST_S = 3600
+JUMP_NS = 3600 * NS
 
 
 @dataclass(frozen=True)
@@ -131,12 +130,7 @@ def _stamp(payload: bytes, topic: Topic) -> bytes:
     return codec.encode(shift_stamp(message, -PAST_S), topic.type) if hasattr(message, "header") else payload
 
 
-CHANGES: Final[dict[str, Callable[[bytes, Topic], bytes]]] = {
-    "corrupt": _corrupt,
-    "truncate": lambda payload, _: payload[: len(payload) // 2],
-    "nan": _nan,
-    "stamp": _stamp,
-}
+CHANGES = {"corrupt": _corrupt, "truncate": lambda payload, _: payload[: len(payload) // 2], "nan": _nan, "stamp": _stamp}
 
 
 def command(role: str, fault: InjectedFault) -> tuple[str, ...]:

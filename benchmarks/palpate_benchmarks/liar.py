@@ -17,8 +17,6 @@ A sensor lies in all its topics.
 | `repeated`, `disordered`, `stale` | the message of the moment; every second one an older one; the stamp is the amount [s] old |
 """
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -75,7 +73,7 @@ class Lie(NamedTuple):
     """Simulated time from which on it is sent."""
 
     @classmethod
-    def parse(cls, text: str) -> Lie:
+    def parse(cls, text: str) -> "Lie":
         """Return the lie of a text with the values of the fields."""
         topic, path, kind, amount, at_s = text.split()
         return cls(topic, path, kind, float(amount), float(at_s))

@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.sparse.linalg import spsolve
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -90,7 +89,7 @@ def static_force(depth: float, radius: float, k_w: Profile, shear: Profile, h: f
     raise RuntimeError(f"foundation: no contact set after {MOST_ITERATIONS} iterations at depth {depth} m")
 
 
-def _solve(diagonal: Array, spring: Array, active: NDArray[np.bool_], hold: Array) -> Array:
+def _solve(diagonal: Array, spring: Array, active: Mask, hold: Array) -> Array:
     """Return the equilibrium with `u = hold` where `active` and u = 0 at the outer end."""
     prescribed = active.copy()
     prescribed[-1] = True

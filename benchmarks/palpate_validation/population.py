@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy import stats
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient import remus2024
 from palpate_models.patient.healthy import belly, healthy_wall
@@ -91,7 +90,7 @@ def sample_persons(persons: int = SETUP.persons, build: Build = Build.MEDIAN) ->
     return sample_of(np.repeat(np.arange(persons), SETUP.places).tolist(), np.array(force))
 
 
-def inside_interval(people: pd.DataFrame) -> NDArray[np.bool_]:
+def inside_interval(people: pd.DataFrame) -> Mask:
     """Return for each position whether it is in the 80 % interval that the other people predict for a new person, shape (n,).
 
     ln F is normal between people and between positions of one person; the interval is Student's, for the mean of a few people.

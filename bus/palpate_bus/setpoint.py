@@ -1,7 +1,5 @@
 """Set-point of the impedance controller, as created by planning and followed by the control law."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -65,7 +63,7 @@ class Setpoint(NamedTuple):
         )
 
     @classmethod
-    def from_message(cls, message: ImpedanceSetpoint) -> Setpoint:
+    def from_message(cls, message: ImpedanceSetpoint) -> "Setpoint":
         """Return the set-point in a message, which the port has checked."""
         return cls(
             stamp=nanoseconds(message.header.stamp),

@@ -1,7 +1,5 @@
 """An inbox filled by hand, for tests and benches of a service's step."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +20,7 @@ class HandInbox:
         self.gone: set[str] = set()
         """Lost roles."""
 
-    def put(self, topic: str, message: Any, stamp: int | None = None) -> HandInbox:
+    def put(self, topic: str, message: Any, stamp: int | None = None) -> "HandInbox":
         """Add a message, encoded and decoded, as newest and new. Raises CodecError if it does not fit its type."""
         kind = contract().topics[topic].type
         decoded = codec.decode(codec.encode(message, kind), kind)
@@ -32,7 +30,7 @@ class HandInbox:
             self.stamps[topic] = stamp
         return self
 
-    def receive(self, messages: Mapping[str, Any]) -> HandInbox:
+    def receive(self, messages: Mapping[str, Any]) -> "HandInbox":
         """Replace the new messages by those of one step, by topic. Raises CodecError."""
         self.events.clear()
         for topic, message in messages.items():

@@ -1,7 +1,5 @@
 """Files and text from outside, read within bounds: kind, size, counts and depth are checked before the content is used."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging
@@ -60,7 +58,7 @@ class Bounds(NamedTuple):
     """Nesting of YAML and XML."""
 
     @classmethod
-    def parse(cls, text: str) -> Bounds:
+    def parse(cls, text: str) -> "Bounds":
         """Return the bounds with changes such as `text_kb=1024,depth=80`. Raises ValueError that names what is allowed."""
         pairs = [[word.strip() for word in part.split("=")] for part in text.split(",") if part.strip()]
         for pair in pairs:

@@ -3,8 +3,6 @@
 One call for many rows keeps drawing cheap.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,7 +36,7 @@ class Live(NamedTuple):
     connect_url: str | None = None
 
     @staticmethod
-    def parse(text: str) -> Live:
+    def parse(text: str) -> "Live":
         """Parse PALPATE_VIEWER; an empty value means no live view. Raises ValueError naming the allowed forms."""
         kind, _, rest = text.partition(":")
         if not text:

@@ -1,7 +1,5 @@
 """Text of the dashboard's pages, in Markdown: status, services, findings."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
@@ -77,7 +75,7 @@ class Health(NamedTuple):
     is_topic: bool = False
 
     @classmethod
-    def of(cls, status: Message) -> Health:
+    def of(cls, status: Message) -> "Health":
         """Return the entry of a diagnostic_msgs/DiagnosticStatus."""
         level = status.level if isinstance(status.level, int) else int.from_bytes(bytes(status.level), "little")
         values = {item.key: item.value for item in status.values}

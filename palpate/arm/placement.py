@@ -10,13 +10,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from palpate_errors import RunError
-from palpate_models.numerics.frames import Array, apply, matrix
+from palpate_models.numerics.frames import Array, Mask, apply, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.table import BASE_SIDE_M, TABLE
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Exam, Robot, Scenario
-from palpate_planning.placement.redundancy import POSTURES, Mask, PostureSequence, plan_redundancy
+from palpate_planning.placement.redundancy import POSTURES, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
 

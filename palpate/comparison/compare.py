@@ -1,7 +1,5 @@
 """Two palpations of one body, map against map, at the places where the second one was measured, and their figure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +8,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
@@ -23,7 +20,7 @@ from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import map_of, sample_columns
 from palpate.report.scoring import Map
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array, apply, rigid
+from palpate_models.numerics.frames import Array, Mask, apply, rigid
 
 
 class CompareTuning(NamedTuple):
@@ -57,7 +54,7 @@ class ComparedPalpation(NamedTuple):
     faults: tuple[str, ...] = ()
     """Faults of the recording, for messages."""
 
-    def in_frame(self, X: Array) -> ComparedPalpation:
+    def in_frame(self, X: Array) -> "ComparedPalpation":
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
         return self._replace(map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
 
@@ -205,7 +202,7 @@ def _registration(a: ComparedPalpation, b: ComparedPalpation) -> Array:
     return rigid(R, middle + motion[:3] - R @ middle)
 
 
-def _interval(inside: NDArray[np.bool_]) -> Interval:
+def _interval(inside: Mask) -> Interval:
     """Return the bootstrap interval of a share over places."""
     if inside.all() or not inside.any():
         return float(inside.mean()), float(inside.mean())

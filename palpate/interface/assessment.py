@@ -1,7 +1,5 @@
 """The assessment of touches of a patient: the assessment service, without a bus."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Iterable, Sequence
@@ -15,7 +13,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from palpate.apart import run_guarded
@@ -32,7 +29,7 @@ from palpate.run.roles import foreign_roles
 from palpate_bus.messages import NS, ExamState, header
 from palpate_bus.messages.geometry import mesh_message
 from palpate_conductor.collector import Collected
-from palpate_models.numerics.frames import Array, apply
+from palpate_models.numerics.frames import Array, Ints, apply
 from palpate_models.numerics.maps import half_width
 from palpate_models.scenario.load import exam_input
 from palpate_planning.contact import THRESHOLDS
@@ -45,13 +42,13 @@ DEPTH_SD_M = 0.0003
 class StiffnessMap(Map):
     """Apparent stiffness over the skin with its 90 % band; n nodes, in the abdomen frame as registered."""
 
-    triangles: NDArray[np.int64]
+    triangles: Ints
     """Nodes of each triangle, shape (m, 3), counter-clockwise seen from outside."""
     background: float
     """Level of the unremarkable tissue's apparent stiffness [N]."""
 
     @classmethod
-    def of(cls, message: Any) -> StiffnessMap:
+    def of(cls, message: Any) -> "StiffnessMap":
         """Return the map of a `palpation_msgs/StiffnessMap`."""
         triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
         return cls(**vars(map_of(message)), triangles=triangles, background=float(message.background))

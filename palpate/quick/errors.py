@@ -9,8 +9,6 @@ and d is the set-point plus the error of regulation. Force is measured by the fo
 each stroke. The error of registration is simulated as it is, without a distribution.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import resources
 from math import exp
@@ -103,7 +101,7 @@ class LoopErrors(Section):
     regulation_s: Positive
     """Its correlation time [s], as of the wander."""
 
-    def draw(self, rng: np.random.Generator) -> Drawn:
+    def draw(self, rng: np.random.Generator) -> "Drawn":
         """Draw the constant errors of one examination."""
         aside = self.aside_m * rng.standard_normal(2)
         offset, tilt = self.offset_m.draw(rng), np.array((self.tilt.draw(rng), self.tilt.draw(rng)))

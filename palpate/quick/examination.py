@@ -17,7 +17,7 @@ import numpy as np
 from palpate.quick.errors import Loop
 from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
 from palpate.truth.pressed import TrueBody, TrueSurface
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Ints, apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import Following, Scenario
@@ -38,7 +38,7 @@ from palpate_planning.stroke import (
 )
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.coverage import strokes, transfer
-from palpate_planning.strokes.path import Ints, SurfacePath, frames_along
+from palpate_planning.strokes.path import SurfacePath, frames_along
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
 from palpate_planning.wall.surface import Foot, PerceivedSurface

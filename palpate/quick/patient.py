@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.apart import run_guarded
 from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array, inverse, matrix
+from palpate_models.numerics.frames import Array, Mask, inverse, matrix
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import restrict_to_view, true_pose, whole_scenario
 from palpate_models.scenario.patterns import stations
@@ -67,7 +66,7 @@ class Touch(NamedTuple):
     `exam.breathing: ignore` the skin at the end of expiration."""
     force: Array
     """Along the outward normal [N], shape (n,)."""
-    steady: NDArray[np.bool_]
+    steady: Mask
     """True at the requested depth, shape (n,); with `exam.breathing: gate` only within a millimetre of the end of expiration."""
     seen: Seen
     """The patient as seen."""

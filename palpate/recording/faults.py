@@ -1,7 +1,5 @@
 """Faults of a recording: codes, counts and what was done; the text is made here and nowhere else."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +10,7 @@ class FaultCode(StrEnum):
 
     text: str
 
-    def __new__(cls, code: str, text: str) -> FaultCode:
+    def __new__(cls, code: str, text: str) -> "FaultCode":
         """Return the member of a code."""
         member = str.__new__(cls, code)
         member._value_, member.text = code, text

@@ -1,7 +1,5 @@
 """The mapping: what the columns or topics of a recording are, in which units and frames, and with which tool."""
 
-from __future__ import annotations
-
 from math import pi
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -49,7 +47,7 @@ class MappedColumns(Section):
     """Position of the tool at first contact of the probe."""
 
     @model_validator(mode="after")
-    def _check_order(self) -> MappedColumns:
+    def _check_order(self) -> "MappedColumns":
         if (self.time is None) == (self.probe is None):
             raise ValueError("expected one of time and probe")
         return self
@@ -151,7 +149,7 @@ class Mapping(Section):
     body: MappedBody = MappedBody()
 
     @model_validator(mode="after")
-    def _one_source(self) -> Mapping:
+    def _one_source(self) -> "Mapping":
         if (self.table is None) == (self.topics is None):
             raise ValueError("expected one of table and topics")
         return self

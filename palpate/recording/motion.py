@@ -9,16 +9,14 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, percentile_filter
 
 from palpate.recording.readings import Readings
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 
 _LEAST_M2: Final = 1e-15
 """Minimum variance of the positions within a part [m^2]."""
-Mask = NDArray[np.bool_]
 
 
 class FreeMotionTuning(NamedTuple):

@@ -1,7 +1,5 @@
 """Contacts of a table of probes, which has no time."""
 
-from typing import Final
-
 import numpy as np
 
 from palpate.recording import cutting
@@ -12,17 +10,17 @@ from palpate.recording.recording import Contact, ContactKind, Palpated, width
 from palpate.recording.skin import fit_skin, grid_over
 from palpate.recording.timed import implausible_unit, normal_force
 
-_AWAY: Final = 3.0
+_AWAY = 3.0
 """A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
-_TOUCHED: Final = 3.0
+_TOUCHED = 3.0
 """Minimum force of a contact, in SD of the force."""
-_DISORDER: Final = 2.5
+_DISORDER = 2.5
 """Way of a probe's rows, over its depth, that is not one press and its retreat."""
-_MANY: Final = 50
+_MANY = 50
 """Contacts whose places and normals are the skin."""
-_DOUBT: Final = 0.2
+_DOUBT = 0.2
 """Largest uncertainty of a position at first contact that is given, over the travel of a probe."""
-_UNTARED: Final = 0.5
+_UNTARED = 0.5
 """Force at first contact, over that of the probe, that light contact does not have."""
 
 

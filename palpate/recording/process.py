@@ -1,11 +1,8 @@
 """A Gaussian process over places, whose variance, length and noise maximise the marginal likelihood."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -14,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from palpate_models.numerics.frames import Array
 
-_TOGETHER: Final = 200
+_TOGETHER = 200
 Correlation = Callable[[Array], Array]
 """Correlation of values at two places, by their distance over the length, any shape."""
 
@@ -59,7 +56,7 @@ class PlaceProcess:
         """Inverse of the covariance times the values, shape (n,)."""
         return np.asarray(cho_solve((self.cholesky, True), self.values))
 
-    def fit(self, bounds: Sequence[tuple[float, float]]) -> PlaceProcess:
+    def fit(self, bounds: Sequence[tuple[float, float]]) -> "PlaceProcess":
         """Return the process with the most probable parameters within `bounds` of variance, length and further noise."""
 
         def misfit(parameters: Array) -> float:

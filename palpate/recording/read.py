@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from palpate.recording.faults import Fault, FaultCode, Remedy, is_refused
 from palpate.recording.mapping import Mapping, MappingError, read_mapping
-from palpate.recording.motion import Axis, Mask, blocks, pressing_axis
+from palpate.recording.motion import Axis, blocks, pressing_axis
 from palpate.recording.probes import contacts_of_probes, probes
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, move_to_mapped, read_table
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording, implied_young, loading, width
@@ -20,7 +20,7 @@ from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import columns_of, points, xyz
 from palpate_assessment.calibration import load_calibration
 from palpate_bus.messages import NS, nanoseconds
-from palpate_models.numerics.frames import Array, apply, inverse, matrix
+from palpate_models.numerics.frames import Array, Mask, apply, inverse, matrix
 from palpate_models.scenario.load import exam_input, load_scenario
 
 

@@ -1,7 +1,5 @@
 """Reads files: tables by pandas, bags by rosbags; everything in metres, newtons and seconds, as force on the tool."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator
@@ -68,7 +66,7 @@ class Readings:
         """True where the force is within the sensor's range, shape (n,)."""
         return np.ones(len(self.position), bool) if self.clipped is None else ~self.clipped
 
-    def part(self, chosen: NDArray[Any]) -> Readings:
+    def part(self, chosen: NDArray[Any]) -> "Readings":
         """Return some of the readings."""
         columns: dict[str, Any] = {name: None if kept is None else kept[chosen] for name, kept in vars(self).items()}
         return Readings(**columns)

@@ -1,7 +1,5 @@
 """The unpressed skin: a smooth height field through the places where contacts begin, as a Gaussian process."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -55,7 +53,7 @@ class RecordedSkin(NamedTuple):
         z, normal, _ = self.at(xy)
         return np.column_stack((xy, z)), normal
 
-    def through(self, points: Array, sd: Array) -> RecordedSkin:
+    def through(self, points: Array, sd: Array) -> "RecordedSkin":
         """Return the skin moved outward or inward to points of standard deviation `sd` [m], by their weighted mean."""
         off = points[:, 2] - self.at(points[:, :2])[0]
         near = np.abs(off - np.median(off)) <= 5 * np.median(np.abs(off - np.median(off))) + 1e-9

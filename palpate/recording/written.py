@@ -1,7 +1,6 @@
 """The results of a recording as files, as those of a run."""
 
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
 from palpate_models.section import Pose
 
-RUNTIME: Final = "recording"
+RUNTIME = "recording"
 
 
 def scenario_of(recording: PalpationRecording) -> Scenario:

@@ -19,9 +19,7 @@ from scipy.spatial import Delaunay
 from palpate.report.rows import FindingRow, FindingScore, Scores
 from palpate.truth.felt import Felt, Lump
 from palpate.truth.pressed import Touched, TrueBody, TrueSurface
-from palpate_models.numerics.frames import Array, apply
-
-Mask = NDArray[np.bool_]
+from palpate_models.numerics.frames import Array, Mask, apply
 
 MATCHING_DICE: Final = 0.3
 

@@ -4,7 +4,6 @@ import logging
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Final
 
 import typer
 from rich.console import Console
@@ -26,7 +25,7 @@ from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
 _NAMES = ("OPERATOR_STOP", "ROBOT_HOLD", "EMERGENCY_STOP", "NOT_RELEASED")
-HOLD_REASONS: Final = frozenset(getattr(ExamState, f"REASON_{name}") for name in _NAMES)
+HOLD_REASONS = frozenset(getattr(ExamState, f"REASON_{name}") for name in _NAMES)
 """Reasons for which planning gives up with a text that has the cause of the hold."""
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Final
 
 from palpate.report.files import bring_back
 from palpate.run.inputs import Outlook, duration_text
@@ -21,7 +20,7 @@ from palpate_conductor.outcome import RunProgress, Tell
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Exam
 
-OF_A_RUN: Final = (
+OF_A_RUN = (
     *("run.json", "scenario.yaml", "plant.yaml", "exam.yaml", "bus.json", "logs", RECORDING, "recording.rrd"),
     *("evidence.mcap", "samples.csv", "report.json", "report.html", "map.png"),
 )
@@ -130,7 +129,7 @@ def lock_output(out: Path) -> Iterator[None]:
 MB = 1_000_000
 REPORT_MB = 10
 """Report, page, map, evidence and logs."""
-RECORDED_MB_PER_S: Final[dict[Record, float]] = {"none": 0.0, "normal": 0.3, "full": 2.5}
+RECORDED_MB_PER_S = {"none": 0.0, "normal": 0.3, "full": 2.5}
 """Both recordings, per simulated second."""
 LOW_MB = 20
 """Free space below which a warning is printed."""

@@ -1,7 +1,5 @@
 """Checks and estimates of an examination before it starts: phantom, scan on the true body, services, duration, presses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -62,7 +60,7 @@ class Outlook(NamedTuple):
     """Pressed targets; of a search, an upper limit."""
 
     @staticmethod
-    def of(exam: Exam) -> Outlook:
+    def of(exam: Exam) -> "Outlook":
         """Return the estimates for an examination; the duration is a fit to examinations of several sizes."""
         scan = scan_safely(exam, _flat)
         touches = len(touch_centres(scan.targets))

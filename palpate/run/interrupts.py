@@ -8,10 +8,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from threading import current_thread, main_thread
 from types import FrameType
-from typing import Final
 
-SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-ANSWER: Final = b"\npalpate: ending and writing the results, which takes some seconds; another Ctrl-C discards them\n"
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ANSWER = b"\npalpate: ending and writing the results, which takes some seconds; another Ctrl-C discards them\n"
 
 
 @dataclass
@@ -25,7 +24,7 @@ class Ending:
     answered: bool = False
 
 
-_CURRENT: Final[ContextVar[Ending | None]] = ContextVar("_CURRENT", default=None)
+_CURRENT: ContextVar[Ending | None] = ContextVar("_CURRENT", default=None)
 
 
 def all_is_measured() -> None:

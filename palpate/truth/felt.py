@@ -8,16 +8,13 @@ of A; areas are on the skin.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import label, maximum
 from scipy.spatial import Delaunay
 
 from palpate.truth.pressed import Pressed, TrueSurface
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.schema import Exam
-
-Mask = NDArray[np.bool_]
 
 RASTER_M: Final = 0.001
 """Pitch of the raster on which areas are compared."""

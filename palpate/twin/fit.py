@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
@@ -25,7 +24,7 @@ from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_assessment.sampling import ForceSample
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.grid import BodyGrid
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Phantom, Stiffness
@@ -162,7 +161,7 @@ class FittedWall(NamedTuple):
     onset_m: float
     """Depth at which the recording noticed the contact [m]."""
     presses: list[FittedPress]
-    held_out: NDArray[np.bool_]
+    held_out: Mask
     """True for presses that were not fitted, shape (n,)."""
 
 

@@ -3,8 +3,6 @@
 The runtime connects services by `Contract.inputs(role)` and `Contract.outputs(role)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from enum import StrEnum
 from functools import cache
@@ -205,7 +203,7 @@ class Contract(_Row):
     internal: dict[str, Internal]
 
     @model_validator(mode="after")
-    def _check(self) -> Contract:
+    def _check(self) -> "Contract":
         for topic in self.topics.values():
             codec.message_type(topic.type)
             for role in (topic.producer, *topic.readers):

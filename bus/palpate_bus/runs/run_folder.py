@@ -15,15 +15,14 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from time import time
-from typing import Final
 from uuid import uuid4
 
 from palpate_inputs import read_json
 
-FILE: Final = "run.json"
-LOCK: Final = "run.lock"
+FILE = "run.json"
+LOCK = "run.lock"
 """File in a results folder that the run locks; it contains the process id. The kernel releases the lock at the end."""
-_LENGTH: Final = 12
+_LENGTH = 12
 
 
 def name_run(folder: Path) -> str:
@@ -52,10 +51,10 @@ def run_of(folder: Path) -> str:
     return ""
 
 
-PREFIX: Final = "palpate-run-"
-_LOCK: Final = "lock"
-SHARED_MEMORY: Final = Path("/dev/shm")
-YOUNG_S: Final = 60.0
+PREFIX = "palpate-run-"
+_LOCK = "lock"
+SHARED_MEMORY = Path("/dev/shm")
+YOUNG_S = 60.0
 """Younger segments may not be locked yet."""
 
 

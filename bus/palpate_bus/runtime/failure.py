@@ -1,7 +1,5 @@
 """Failures of runs and services: a code for programs and a text for people."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -70,12 +68,12 @@ class Failure(NamedTuple):
     def __str__(self) -> str:
         return self.text
 
-    def with_note(self, note: str) -> Failure:
+    def with_note(self, note: str) -> "Failure":
         """Return the same failure with `note` appended to its text."""
         return self._replace(text=f"{self.text}; {note}")
 
     @classmethod
-    def of(cls, error: BaseException, role: str, buffers: Iterable[InputBuffer]) -> Failure:
+    def of(cls, error: BaseException, role: str, buffers: Iterable[InputBuffer]) -> "Failure":
         """Return the failure of the service `role` that raised `error`.
 
         The text has the error, preceded by the last line of a user-defined file in its traceback, and each input that breaks the
@@ -100,7 +98,7 @@ class Failure(NamedTuple):
         return {"error": self.text, "code": self.code.value, "roles": self.roles, "topics": self.topics}
 
     @classmethod
-    def from_report(cls, role: str, detail: Mapping[str, Any]) -> Failure:
+    def from_report(cls, role: str, detail: Mapping[str, Any]) -> "Failure":
         """Return the failure that the service `role` reported."""
         code = detail.get("code")
         known = FailureCode(str(code)) if code in {*FailureCode} else FailureCode.ROLE_FAILED

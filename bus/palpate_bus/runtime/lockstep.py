@@ -5,8 +5,6 @@ sequence number, (sequence - 1) * period; those of an event topic get theirs fro
 wire format stays plain ROS 2, and inputs are consumed in (stamp, topic, sequence) order in whatever order they are received.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from collections import deque
@@ -254,7 +252,7 @@ class OutputPort:
         self._unchained: list[Packet] = []
         """Messages that are not in the digest yet; hashing each by itself costs more."""
 
-    def pack(self, message: Message, t: int) -> Outgoing:
+    def pack(self, message: Message, t: int) -> "Outgoing":
         """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
         check = self.check
         if not check.conforms(message, check.past, t):

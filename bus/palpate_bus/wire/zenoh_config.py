@@ -30,8 +30,6 @@ Round trip of 300 bytes between two Python processes (SimpleQueue receivers, fiv
 | TCP, low latency | 79 us | 108 us | 138 us |
 """
 
-from __future__ import annotations
-
 import atexit
 import errno
 import json
@@ -108,7 +106,7 @@ class BusOptions:
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")
 
     @classmethod
-    def from_settings(cls, settings: Settings) -> BusOptions:
+    def from_settings(cls, settings: Settings) -> "BusOptions":
         """Return the options of the settings. Raises BusConfigError with the variable's name."""
         wallclock = settings.runtime == "wallclock"
         given = {field.name: getattr(settings, field.name) for field in fields(cls) if field.name != "drop_wait_us"}

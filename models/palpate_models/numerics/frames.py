@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from palpate_models.section import Pose
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 
 def rigid(R: ArrayLike, p: ArrayLike) -> Array:

@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.mesh_file import IntArray, MeshError, read_mesh
 
 
@@ -245,7 +244,7 @@ def _split_triangles(triangles: IntArray, middle: IntArray, length: Array) -> In
     return np.concatenate(out).astype(np.int32)
 
 
-def boundary_vertices(n: int, triangles: IntArray) -> NDArray[np.bool_]:
+def boundary_vertices(n: int, triangles: IntArray) -> Mask:
     """Return True for each of `n` vertices on an open border, shape (n,)."""
     unique, count = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_counts=True)
     border = np.zeros(n, dtype=np.bool_)

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 from scipy.optimize import brentq
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient import wall
 from palpate_models.patient.field import edge_distance, smoothstep
 from palpate_models.patient.mesh_file import MeshError
@@ -25,7 +24,7 @@ _RINGS = 800
 _MOST_ROUNDS = 200
 
 
-def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, front: NDArray[np.bool_]) -> Array:
+def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, front: Mask) -> Array:
     """Return the tension over k_w [1] of contracted muscle at points (n, 2) of A [m], shape (n,); 0 where `front` is false.
 
     It rises over `edge_m`, centred on the outline. The larger tension counts where areas overlap. Raises MeshError if an area

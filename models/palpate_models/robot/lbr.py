@@ -3,15 +3,13 @@
 Kinematics, limits, masses and inertias: lbr_fri_ros2_stack, `iiwa7_description` and its joint limits. The capsules are ours.
 """
 
-from typing import Final
-
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
+from palpate_models.robot.chain import Arm, Capsule, Inertia
 
-JOINT_NAMES: Final[tuple[str, ...]] = tuple(f"lbr_A{i}" for i in range(1, 8))
-LINK_NAMES: Final[tuple[str, ...]] = (*(f"lbr_link_{i}" for i in range(8)), "lbr_link_ee")
+JOINT_NAMES = tuple(f"lbr_A{i}" for i in range(1, 8))
+LINK_NAMES = (*(f"lbr_link_{i}" for i in range(8)), "lbr_link_ee")
 """The base, the link behind each joint, the flange."""
 
 
@@ -20,16 +18,16 @@ def _freeze(values: Array) -> Array:
     return values
 
 
-POSITION_LIMIT: Final = _freeze(np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]))
+POSITION_LIMIT = _freeze(np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]))
 """Joint positions lie within +- this [rad], shape (7,)."""
-VELOCITY_LIMIT: Final = _freeze(np.deg2rad([98.0, 98.0, 100.0, 130.0, 140.0, 180.0, 180.0]))
+VELOCITY_LIMIT = _freeze(np.deg2rad([98.0, 98.0, 100.0, 130.0, 140.0, 180.0, 180.0]))
 """Joint speed limits [rad/s], shape (7,)."""
-TORQUE_LIMIT: Final = _freeze(np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0]))
+TORQUE_LIMIT = _freeze(np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0]))
 """Joint torque limits [N m], shape (7,)."""
-HOME: Final = _freeze(np.deg2rad([0.0, -25.0, 0.0, -105.0, 0.0, 100.0, 0.0]))
+HOME = _freeze(np.deg2rad([0.0, -25.0, 0.0, -105.0, 0.0, 100.0, 0.0]))
 """Ready posture [rad], shape (7,): folded back over the base, tool straight down, the arm out of the camera's view."""
 
-JOINT_ORIGIN: Final[tuple[Point, ...]] = (
+JOINT_ORIGIN = (
     (0.0, 0.0, 0.1475),
     (0.0, -0.0105, 0.1925),
     (0.0, 0.0105, 0.2075),
@@ -39,9 +37,9 @@ JOINT_ORIGIN: Final[tuple[Point, ...]] = (
     (0.0, 0.0707, 0.091),
 )
 """Origin of joint i + 1 in its parent link i [m]."""
-JOINT_AXIS: Final[tuple[Point, ...]] = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
-LINK_7_TO_FLANGE_M: Final = 0.035
-ARM_INERTIA: Final[tuple[Inertia, ...]] = (
+JOINT_AXIS = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
+LINK_7_TO_FLANGE_M = 0.035
+ARM_INERTIA = (
     Inertia(4.855658, (-0.012857, 0.0, 0.069964), (0.017839, 0.022294, 0.021334), (0.0, 0.000781, 0.0)),
     Inertia(3.394011, (0.0, -0.034819, 0.123299), (0.021383, 0.020403, 0.007563), (0.0, 0.0, 0.003797)),
     Inertia(4.031991, (0.0, 0.039793, 0.086944), (0.031697, 0.030080, 0.009666), (0.0, 0.0, 0.005889)),
@@ -53,7 +51,7 @@ ARM_INERTIA: Final[tuple[Inertia, ...]] = (
 )
 """Links 0 to 7."""
 
-_ARM_CAPSULES: Final[tuple[tuple[Capsule, ...], ...]] = (
+_ARM_CAPSULES = (
     (Capsule((-0.02, 0.0, 0.085), (0.0, 0.0, 0.10), 0.09),),
     (Capsule((0.0, 0.0, 0.035), (0.0, -0.035, 0.19), 0.077),),
     (Capsule((0.0, 0.035, 0.0), (0.0, 0.0105, 0.1675), 0.075),),
@@ -64,10 +62,10 @@ _ARM_CAPSULES: Final[tuple[tuple[Capsule, ...], ...]] = (
     (Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.005), 0.045),),
 )
 
-_SEEDS: Final = tuple((0.0, tilt, 0.0, -bend, 0.0, 1.2, 0.0) for tilt in (0.3, 0.8) for bend in (1.6, 1.0))
+_SEEDS = tuple((0.0, tilt, 0.0, -bend, 0.0, 1.2, 0.0) for tilt in (0.3, 0.8) for bend in (1.6, 1.0))
 """Elbow up, the tool in front of the base."""
 
-ARM: Final = Arm(
+ARM = Arm(
     name="lbr",
     joint_names=JOINT_NAMES,
     link_names=LINK_NAMES,

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_errors import UserError
 from palpate_inputs import read_arrays
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Ints, Mask
 
 
 class CheckpointError(UserError):
@@ -36,9 +35,9 @@ class FeltSoFar:
     """Standard error of the force [N]."""
     time_in_contact: Array
     """[s]"""
-    force_limited: NDArray[np.bool_]
+    force_limited: Mask
     """Depth was reduced by the force limit."""
-    stroke: NDArray[np.int64]
+    stroke: Ints
     """Number of the descent."""
     depth_uncertainty: Array
     """One sigma of the depth [m]."""

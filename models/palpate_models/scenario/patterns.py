@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Ints
 from palpate_models.scenario.schema import PATTERN, Exam
 from palpate_plugins import PluginError
 
@@ -45,7 +44,7 @@ class Scan(NamedTuple):
         return np.concatenate(self.lines)
 
     @property
-    def line_of_target(self) -> NDArray[np.int64]:
+    def line_of_target(self) -> Ints:
         """The line of each target, shape (n,)."""
         return np.repeat(np.arange(len(self.lines)), [len(line) for line in self.lines])
 

@@ -4,23 +4,20 @@ The indenter moves along the inward normal from the touched skin, at constant sp
 stiffness is the mean force at the end of the hold.
 """
 
-from typing import Final
-
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 
-DEPTH_M: Final = 0.010
+DEPTH_M = 0.010
 """Depth below the touched skin."""
-SPEED_MPS: Final = 0.020
-HOLD_S: Final = 0.5
+SPEED_MPS = 0.020
+HOLD_S = 0.5
 """Duration of the hold."""
-READ_S: Final = 0.1
+READ_S = 0.1
 """Averaging window at the end of the hold."""
-LIMIT_N: Final = 15.0
+LIMIT_N = 15.0
 """Force at which the press ends."""
-DURATION_S: Final = DEPTH_M / SPEED_MPS + HOLD_S
+DURATION_S = DEPTH_M / SPEED_MPS + HOLD_S
 
 
 def times(step_s: float) -> Array:
@@ -33,7 +30,7 @@ def depths(times_s: Array) -> Array:
     return np.asarray(np.minimum(SPEED_MPS * times_s, DEPTH_M))
 
 
-def apparent_stiffness(forces: Array) -> tuple[Array, NDArray[np.bool_]]:
+def apparent_stiffness(forces: Array) -> tuple[Array, Mask]:
     """Return the apparent stiffness [N] of presses, and True for those that ended at LIMIT_N, shape (k,) each.
 
     `forces` [N], shape (k, n): at the ends of equal steps over a whole press.

@@ -5,8 +5,6 @@ World frame W: origin on the floor under the robot, z up, x towards the table. A
 x to the patient's left, y to the head, z outward.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from enum import StrEnum
@@ -222,7 +220,7 @@ class Camera(Section):
     """Number of frames fused for a perceived surface."""
 
     @model_validator(mode="after")
-    def _apart(self) -> Camera:
+    def _apart(self) -> "Camera":
         if dist(self.position_m, self.look_at_m) < 0.1:
             raise ValueError(f"camera.position_m {self.position_m} and look_at_m {self.look_at_m}: expected 0.1 m or more apart")
         return self
@@ -255,7 +253,7 @@ class Limits(Section):
     """Share of the joint velocity limits used in free motion."""
 
     @model_validator(mode="after")
-    def _order(self) -> Limits:
+    def _order(self) -> "Limits":
         if not self.force_working_n < self.force_soft_stop_n < self.force_emergency_n:
             raise ValueError("need force_working_n < force_soft_stop_n < force_emergency_n")
         for axis, low, high in zip("xyz", self.workspace_min_m, self.workspace_max_m, strict=True):

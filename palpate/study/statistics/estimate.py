@@ -1,7 +1,5 @@
 """A figure with its interval and its sample size; rates with Wilson intervals, everything else by a bootstrap over patients."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import isfinite
 from typing import Any, Final, NamedTuple
@@ -63,7 +61,7 @@ class Bootstrap(NamedTuple):
     """Number of draws of each patient, shape (folds, patients)."""
 
     @staticmethod
-    def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> Bootstrap:
+    def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> "Bootstrap":
         """Draw the resamplings; `populations`: population of each patient, shape (patients,)."""
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"bootstrap over patients")])))
         names = np.asarray(populations)

@@ -1,7 +1,5 @@
 """A study's three tables for statistics: patients that methods share, and failures counted against the method."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -44,7 +42,7 @@ class Variant(NamedTuple):
     lumps: pd.DataFrame
     """Lumps with `patient`; those of failed cases are not found, with confidence 0."""
 
-    def only(self, patients: NDArray[np.intp]) -> Variant:
+    def only(self, patients: NDArray[np.intp]) -> "Variant":
         """Return the variant of these patients only."""
         tables = (table[table["patient"].isin(patients)] for table in (self.cases, self.findings, self.lumps))
         return Variant(self.name, *tables)

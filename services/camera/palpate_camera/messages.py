@@ -4,8 +4,6 @@ Pixel (u, v) looks along ((u - cx)/fx, (v - cy)/fy, 1) of the optical frame C (x
 coordinates, as in ROS, so the principal point of a w x h image is ((w - 1)/2, (h - 1)/2).
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,7 +26,7 @@ class Pinhole(NamedTuple):
     cy: float
 
     @classmethod
-    def of(cls, camera: Camera) -> Pinhole:
+    def of(cls, camera: Camera) -> "Pinhole":
         """Return the intrinsics of a scenario's camera."""
         focal = camera.focal_px
         return cls(camera.width_px, camera.height_px, focal, focal, (camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
@@ -38,7 +36,7 @@ class Pinhole(NamedTuple):
         """K [px], shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def every(self, k: int) -> Pinhole:
+    def every(self, k: int) -> "Pinhole":
         """Return the camera of every `k`-th pixel: its pixel (i, j) is (k // 2 + k i, k // 2 + k j) of this one."""
         first = k // 2
         size = len(range(first, self.width, k)), len(range(first, self.height, k))

@@ -6,9 +6,8 @@ measure or supervise, and a perception that did not process the first scan has n
 
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Final
 
-REPLACEABLE: Final = frozenset({"camera", "assessment"})
+REPLACEABLE = frozenset({"camera", "assessment"})
 
 
 @dataclass

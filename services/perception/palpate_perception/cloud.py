@@ -10,8 +10,6 @@ converges to the true depth, which the median does not. The mean is taken over t
 excludes frames in which the pixel shows something behind an edge.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,7 +47,7 @@ class Intrinsics(NamedTuple):
     shape: tuple[int, int]
     """Height and width of the full image [px]."""
 
-    def same(self, other: Intrinsics) -> bool:
+    def same(self, other: "Intrinsics") -> bool:
         """Return True if the other has the same intrinsics and pose."""
         return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)
 
@@ -64,7 +62,7 @@ class Cloud(NamedTuple):
     pixel: NDArray[np.intp]
     """Row and column in the fused window, shape (n, 2)."""
 
-    def where(self, keep: NDArray[np.bool_]) -> Cloud:
+    def where(self, keep: NDArray[np.bool_]) -> "Cloud":
         """Return the points of a mask, shape (n,)."""
         return Cloud(self.p_W[keep], self.sigma[keep], self.pixel[keep])
 
@@ -76,7 +74,7 @@ class RegionBox(NamedTuple):
     high: tuple[float, float, float]
 
     @classmethod
-    def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> RegionBox:
+    def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> "RegionBox":
         """Return the region of an exam, wider by `margin` [m] on each side, between the heights `z` [m]."""
         (cx, cy), (width, height) = exam.centre_m, exam.region_m
         half_x, half_y = width / 2 + margin, height / 2 + margin

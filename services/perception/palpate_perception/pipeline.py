@@ -1,7 +1,5 @@
 """Surface and palpation targets from a fused depth image, by the paper's five steps (section III.A)."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -51,7 +49,7 @@ class Targets(NamedTuple):
     """Index of the scan line, shape (n,)."""
 
     @classmethod
-    def none(cls) -> Targets:
+    def none(cls) -> "Targets":
         """Return an empty list of targets."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint32))
 

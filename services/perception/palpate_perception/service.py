@@ -1,7 +1,5 @@
 """Perception as a service: fuses the frames that follow a trigger, publishes what they show, and follows the wall."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -140,7 +138,7 @@ class PerceptionService(Service):
             "targets": len(self._last.targets.p_W),
         }
 
-    def _fuse(self, burst: _Burst, inbox: Inbox) -> None:
+    def _fuse(self, burst: "_Burst", inbox: Inbox) -> None:
         """Add the waiting frames once intrinsics and pose are known; over a network they may arrive later."""
         if not burst.waiting:
             return

@@ -4,9 +4,8 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Mask, apply, inverse
 from palpate_models.scenario.schema import Exam
 from palpate_perception.cloud import project
 
@@ -35,7 +34,7 @@ def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), (counts[0], counts[1])
 
 
-def find_seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
+def find_seen(p_A: Array, exam: Exam) -> Mask:
     """Return the mask of cells with a point of the cloud, shape (nx * ny,)."""
     _, (nx, ny) = cells(exam)
     low = np.array(exam.centre_m) - np.array(exam.region_m) / 2

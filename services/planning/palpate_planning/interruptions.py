@@ -7,14 +7,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.schema import Exam, Following, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.motion.timing import JerkLimitedAxis
 from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
 from palpate_planning.stroke import Duration
 from palpate_planning.stroke_motion import MOTION
-from palpate_planning.strokes.coverage import Bools
 from palpate_planning.strokes.path import PathPoint, centre
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
@@ -217,7 +216,7 @@ class Recovery:
         self._skip(segment, segment.path.visits > s - 1e-6, cause)
         self.resume_at, self._repeats = None, 0
 
-    def _skip(self, segment: Segment, visits: Bools, cause: Cause) -> None:
+    def _skip(self, segment: Segment, visits: Mask, cause: Cause) -> None:
         """Skip targets, unless the wall is only touched there: they are pressed later."""
         if not segment.touch:
             self.skipped |= dict.fromkeys((int(i) for i in segment.path.targets[visits]), cause)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from math import cos, sqrt
-from typing import Final
 
 import numpy as np
 import pinocchio as pin
@@ -17,17 +16,17 @@ def _freeze(values: list[float]) -> Array:
     return array
 
 
-NORMAL_STIFFNESS: Final = 5000.0
+NORMAL_STIFFNESS = 5000.0
 """K_z [N/m] along the tool: the depth error is 0.4 to 1.5 mm even before regulation."""
-CARTESIAN_STIFFNESS: Final = _freeze([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
+CARTESIAN_STIFFNESS = _freeze([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
 """[N/m, N m/rad] in axes of the indenter: stiff along the tool, softer across it, softest in spin."""
-DAMPING_RATIO: Final = _freeze([0.8] * 6)
-POSTURE_STIFFNESS: Final = 20.0
+DAMPING_RATIO = _freeze([0.8] * 6)
+POSTURE_STIFFNESS = 20.0
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
-_NO_TWIST: Final = _freeze([0.0] * 6)
-_NO_WRENCH: Final = _freeze([0.0] * 6)
-_NO_JOINTS: Final = _freeze([])
-AT_REST: Final = Setpoint(
+_NO_TWIST = _freeze([0.0] * 6)
+_NO_WRENCH = _freeze([0.0] * 6)
+_NO_JOINTS = _freeze([])
+AT_REST = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,
     R_WD=np.eye(3),
@@ -62,7 +61,7 @@ def cartesian_setpoint(
     return AT_REST._replace(stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=np.full_like(q, POSTURE_STIFFNESS), **motion)
 
 
-RATE_SHARE: Final = 0.8
+RATE_SHARE = 0.8
 """Share of the contract's rates with which set-points return to the arm."""
 
 

@@ -4,8 +4,6 @@
 indenter (`StrokeMotion`) and yields the stage of the stroke. The planning service and the quick tier drive the same generators.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from enum import Enum
 from typing import Final, NamedTuple, TypeVar
@@ -125,7 +123,7 @@ def clearance(sigma: float) -> float:
     return min(max(STROKE.hop_height_m, TOUCH.sigmas * sigma + TOUCH.margin_m), SEGMENTS.hover_m)
 
 
-def press(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
+def press(motion: StrokeMotion, descent: "Descent") -> Stages[Cause]:
     """Press along the segment; return why the wall was not pressed, if it was not."""
     yield from _rest(motion, descent)
     cause = yield from _descend(motion, descent)
@@ -139,7 +137,7 @@ def press(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
     return NO_CAUSE
 
 
-def _rest(motion: StrokeMotion, descent: Descent) -> Stages[None]:
+def _rest(motion: StrokeMotion, descent: "Descent") -> Stages[None]:
     """Rest above the wall, in free air, until the sensor is tared."""
     descent.start()
     height, rested = 0.0, False
@@ -153,7 +151,7 @@ def _rest(motion: StrokeMotion, descent: Descent) -> Stages[None]:
             rested = descent.rest(height)
 
 
-def _descend(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
+def _descend(motion: StrokeMotion, descent: "Descent") -> Stages[Cause]:
     """Descend to the touch, and in tissue to depth, or as deep as the force allows."""
     while not descent.probe((yield StrokeStage.DESCEND)):
         if descent.failed:

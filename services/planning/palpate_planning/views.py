@@ -1,11 +1,10 @@
 """Views of the abdomen, and the part of the examination that is planned again after an interruption."""
 
 from dataclasses import dataclass
-from typing import Final
 
 from palpate_models.numerics.frames import Array
 
-LOOKS_MAX: Final = 3
+LOOKS_MAX = 3
 
 
 class Views:

@@ -10,14 +10,11 @@ The amplitudes of natural variation and depth errors are unknown: S has a few va
 adds one row to each Cholesky factor, so an update takes about a millisecond.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
@@ -25,7 +22,7 @@ from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import field_covariances, lump_covariance
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, USUAL
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario import press
 from palpate_plugins import PluginKind
 from palpate_search.presses import PRESSES, Budget, Press, Task, press_duration
@@ -98,7 +95,7 @@ class Posterior:
         places = task.places
         self.centres: Array = np.tile(places, (len(LUMPS.radii_m), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
-        self.open: NDArray[np.bool_] = np.ones(len(places), dtype=bool)
+        self.open: Mask = np.ones(len(places), dtype=bool)
         """Places that may be pressed, shape (p,): all but those that the arm could not take."""
         self.radii: Array = np.repeat(LUMPS.radii_m, len(places))
         """Their radii [m], shape (h,)."""
@@ -238,7 +235,7 @@ class Posterior:
         """Exclude the place nearest to xy [m], shape (2,): the arm cannot press it."""
         self.open[np.argmin(np.linalg.norm(self.task.places - xy, axis=1))] = False
 
-    def accept(self, bump: Bump) -> Posterior:
+    def accept(self, bump: Bump) -> "Posterior":
         """Return the posterior of further lumps, given this one."""
         other = Posterior(self.task, (*self.accepted, bump), self._models)
         for felt in self.presses:

@@ -1,7 +1,5 @@
 """Data of a search: the task (region, limits), presses, and the budget."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
@@ -97,7 +95,7 @@ class Task:
         return PRESSES.shallowest_ratio * self.depth
 
     @classmethod
-    def of(cls, known: ExamInput) -> Task:
+    def of(cls, known: ExamInput) -> "Task":
         """Return the task of an examination."""
         exam, limits = known.exam, known.limits
         deepest = min(PRESSES.deepest_ratio * exam.depth_m, limits.depth_m)

@@ -1,7 +1,5 @@
 """Interface of the tissue physics behind the service: implement `TissueBackend` for another tissue."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from math import isfinite
 
@@ -51,7 +49,7 @@ class TissueBackend(ABC):
     def settle(self) -> None:
         """Reset the body to its undisturbed rest state."""
 
-    def in_steps_of(self, dt: float) -> TissueBackend:
+    def in_steps_of(self, dt: float) -> "TissueBackend":
         """Return this body, at rest, for steps of about `dt` [s] if the physics allows them, else with its own steps."""
         self.settle()
         return self

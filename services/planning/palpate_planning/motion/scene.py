@@ -7,9 +7,8 @@ from typing import NamedTuple
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array, apply
+from palpate_models.numerics.frames import Array, Ints, apply
 from palpate_models.robot import table
 from palpate_models.robot.arm import arm_of, capsules, count_mounted, link_names, urdf
 from palpate_models.scenario.schema import Robot
@@ -79,7 +78,7 @@ def _arm_pairs(robot: Robot) -> frozenset[tuple[int, int]]:
     return frozenset(pair for pair, always in zip(pairs, touching, strict=True) if not always or links[pair[1]] in tool)
 
 
-def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
+def mesh_geometry(vertices: Array, triangles: Ints) -> coal.BVHModelOBBRSS:
     """Return a triangle mesh for coal: vertices [m], shape (n, 3), vertex indices, shape (m, 3)."""
     geometry = coal.BVHModelOBBRSS()
     geometry.beginModel(len(triangles), len(vertices))
@@ -90,7 +89,7 @@ def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHMode
     return geometry
 
 
-def with_skirt(vertices: Array, triangles: NDArray[np.int64], floor: float) -> tuple[Array, NDArray[np.int64]]:
+def with_skirt(vertices: Array, triangles: Ints, floor: float) -> tuple[Array, Ints]:
     """Return the mesh with walls from its border down to height `floor` [m], which closes the space below the surface."""
     edges = np.concatenate([triangles[:, (0, 1)], triangles[:, (1, 2)], triangles[:, (2, 0)]])
     keys = np.sort(edges, axis=1)
@@ -110,11 +109,7 @@ class CollisionScene:
     """Collision checks of arm postures and motions. `abdomen`: (vertices in world, triangles), None before perception."""
 
     def __init__(
-        self,
-        kinematics: ArmKinematics,
-        robot: Robot,
-        abdomen: tuple[Array, NDArray[np.int64]] | None = None,
-        tool_may_touch: bool = False,
+        self, kinematics: ArmKinematics, robot: Robot, abdomen: tuple[Array, Ints] | None = None, tool_may_touch: bool = False
     ) -> None:
         """`tool_may_touch`: allows contact of stand-off and sphere with the abdomen."""
         self._model = kinematics.model

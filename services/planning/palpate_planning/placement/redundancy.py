@@ -7,8 +7,6 @@ far from joint limits and singularities, little torque at the pressing force, el
 `palpate arm place` optimises the base placement with the same costs.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,12 +15,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import cKDTree
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.schema import Robot
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
-
-Mask = NDArray[np.bool_]
 
 
 class ResolutionTuning(NamedTuple):
@@ -91,7 +87,7 @@ class Batch:
             q = np.clip(q, *self.limits)
         return q
 
-    def part(self, indices: NDArray[np.intp]) -> Batch:
+    def part(self, indices: NDArray[np.intp]) -> "Batch":
         """Return a batch with some of the targets."""
         return Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limits, self.force)
 

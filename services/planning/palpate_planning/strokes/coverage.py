@@ -10,15 +10,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Ints, Mask
 from palpate_models.scenario.patterns import touch_centres
 from palpate_models.scenario.schema import Mode
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 class CoverageTuning(NamedTuple):
@@ -72,7 +68,7 @@ def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
     return np.asarray((1 - u) ** 3 * p0 + 3 * u * (1 - u) ** 2 * b1 + 3 * u**2 * (1 - u) * b2 + u**3 * p1)
 
 
-def _runs(lines: Ints, usable: Bools, breaks: Set[int], *, pointwise: bool) -> list[Ints]:
+def _runs(lines: Ints, usable: Mask, breaks: Set[int], *, pointwise: bool) -> list[Ints]:
     """Return unbroken runs of usable targets within one line, in order."""
     runs: list[list[int]] = []
     for i in np.flatnonzero(usable):
@@ -89,7 +85,7 @@ def _direction(a: Array, b: Array) -> Array:
 
 
 def strokes(
-    xy: Array, lines: Ints, usable: Bools, joined: bool, mode: Mode, spacing: float, breaks: Set[int] = frozenset()
+    xy: Array, lines: Ints, usable: Mask, joined: bool, mode: Mode, spacing: float, breaks: Set[int] = frozenset()
 ) -> list[Stroke]:
     """Return strokes that visit all usable targets in their order.
 
@@ -127,7 +123,7 @@ def strokes(
     return merged
 
 
-def touches(xy: Array, usable: Bools) -> list[Stroke]:
+def touches(xy: Array, usable: Mask) -> list[Stroke]:
     """Return touches at usable targets near the centres of equal cells, the last one near the first target."""
     candidates = np.flatnonzero(usable)
     if not len(candidates):

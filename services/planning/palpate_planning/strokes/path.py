@@ -8,11 +8,10 @@ from bisect import bisect_right
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Ints
 from palpate_planning.motion.timing import SpeedLimit
 from palpate_planning.wall.surface import CubicPieces, PerceivedSurface, cubic_at
 
@@ -54,9 +53,6 @@ def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
     axis_by_sine = 0.5 * np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]))
     sine = np.sqrt(axis_by_sine @ axis_by_sine)
     return axis_by_sine * (np.arcsin(sine) / (sine * dt) if sine > 0.0 else 1.0 / dt)
-
-
-Ints = NDArray[np.int64]
 
 
 class PathLimits(NamedTuple):

@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array, apply, inverse, rigid
+from palpate_models.numerics.frames import Array, Ints, apply, inverse, rigid
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
@@ -19,8 +18,6 @@ from palpate_planning.strokes.path import centre
 from palpate_planning.strokes.requests import PressPlanner
 from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner, collision
 from palpate_planning.wall.surface import PerceivedSurface
-
-Ints = NDArray[np.int64]
 
 
 class ScanPostures(NamedTuple):

@@ -1,7 +1,5 @@
 """Plans the presses requested by the search, one at a time, from the hover pose."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,7 +25,7 @@ class PressRequest(NamedTuple):
     reason: str = ""
     """Text for the end of the search."""
 
-    def shift_by(self, shift_A: Array) -> PressRequest:
+    def shift_by(self, shift_A: Array) -> "PressRequest":
         """Return the same place of a body that has moved by `shift_A` [m], shape (2,), since the first view."""
         return self if self.xy is None else self._replace(xy=self.xy + shift_A)
 

@@ -6,7 +6,6 @@ is three convolutions in numpy, for a region of any size.
 
 from functools import cache
 from importlib.resources import as_file, files
-from typing import Final
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from palpate_models.numerics.frames import Array
 from palpate_search.posterior import Posterior, maps
 from palpate_search.presses import Budget
 
-WEIGHTS: Final = "ppo.npz"
+WEIGHTS = "ppo.npz"
 
 
 @cache

@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 
 from palpate_camera.backends.kinect.scene import Image, View
 from palpate_camera.messages import Pinhole
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.errors import DrawnCamera
-
-Mask = NDArray[np.bool_]
 
 
 class DepthBias:

@@ -14,8 +14,6 @@ and does so inside of it, and before the camera, where none of e_a . r, e_b . r,
 v, so a triangle that reaches behind the camera needs no clipping.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -116,11 +114,11 @@ class View(NamedTuple):
     """Cosine of the angle between the ray and the facet's normal, in [0, 1]."""
 
     @classmethod
-    def empty(cls, height: int, width: int) -> View:
+    def empty(cls, height: int, width: int) -> "View":
         """Return a view of nothing."""
         return cls(*(np.zeros((height, width), np.float32) for _ in range(4)))
 
-    def nearest(self, other: View) -> View:
+    def nearest(self, other: "View") -> "View":
         """Return the view of both scenes: at each pixel, what is nearer."""
         near = other.w > self.w
         return View(*(np.where(near, b, a) for a, b in zip(self, other, strict=True)))

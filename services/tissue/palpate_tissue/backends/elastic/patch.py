@@ -1,7 +1,5 @@
 """The vertices near the sphere: unilateral contact, nonlinear springs, and their step."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -11,11 +9,9 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from palpate_errors import RunError
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient import wall
 from palpate_tissue.contact import RIM, Near, Push
-
-Mask = NDArray[np.bool_]
 
 _GUESSES = 25
 """Rounds of the fast rule before the rule that always terminates."""
@@ -102,7 +98,7 @@ class VertexSprings(NamedTuple):
     tension: Array
     """[1], shape (m,)."""
 
-    def at(self, index: NDArray[np.intp]) -> VertexSprings:
+    def at(self, index: NDArray[np.intp]) -> "VertexSprings":
         """Return the springs of some of the vertices."""
         return VertexSprings(self.gain[index], self.stiffening[index], self.tension[index])
 

@@ -11,8 +11,6 @@ outputs:
     wrench.force: {variable: contact_force, kind: vector}
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -59,7 +57,7 @@ class OutputEntry(MapEntry):
     value: FiniteFloat | str | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> OutputEntry:
+    def _one(self) -> "OutputEntry":
         if sum(source is not None for source in (self.variable, self.scenario, self.value)) != 1:
             raise ValueError("expected exactly one of variable, scenario, value")
         return self

@@ -5,8 +5,6 @@ array (`vertices`), or a message of numbers only (`pose.position`, a quaternion)
 fields.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import attrgetter
@@ -49,7 +47,7 @@ class Unit(NamedTuple):
     factor: float = 1.0
     offset: float = 0.0
 
-    def to(self, other: Unit) -> tuple[float, float]:
+    def to(self, other: "Unit") -> tuple[float, float]:
         """Return factor and offset that convert a value in this unit to `other`."""
         return self.factor / other.factor, (self.offset - other.offset) / other.factor
 
