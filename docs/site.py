@@ -27,16 +27,16 @@ from palpate.study.summary import summarise
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
 GENERATED = {
-    "docs/topics.md": "topics",
-    "docs/settings.md": "settings",
-    "docs/fault-tables.md": "faults",
-    "docs/validation.md": "validation",
-    "docs/errors.md": "errors",
-    "docs/scenario.md": "scenario",
-    "docs/reference/commands.md": "commands",
-    "docs/reference/messages.md": "messages",
+    "docs/topics.md": "topics:page",
+    "docs/settings.md": "reference:settings",
+    "docs/fault-tables.md": "faults:page",
+    "docs/validation.md": "reference:validation",
+    "docs/errors.md": "errors:page",
+    "docs/scenario.md": "scenario:page",
+    "docs/reference/commands.md": "commands:page",
+    "docs/reference/messages.md": "reference:messages",
 }
-"""Modules of docs/generate by the page that they generate."""
+"""Module of docs/generate, and its function, by the page that it generates."""
 STUDIES = {
     "detectability": "palpate study detectability --number 60",
     "guarding": "palpate study guarding",
@@ -80,7 +80,8 @@ def generate_pages() -> dict[Path, str]:
     """Return the generated pages by their path in the repository."""
     if (folder := str(ROOT / "docs")) not in sys.path:
         sys.path.insert(0, folder)
-    return {Path(path): import_module(f"generate.{module}").page() for path, module in GENERATED.items()}
+    named = {path: where.split(":") for path, where in GENERATED.items()}
+    return {Path(path): getattr(import_module(f"generate.{module}"), page)() for path, (module, page) in named.items()}
 
 
 def execute(notebook: Path, into: Path) -> None:

@@ -54,7 +54,7 @@ def perceive(
 
 
 def perceive_recording(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
-    """Return the result of perception from all images of a recording. Raises RunError if there is no surface."""
+    """Return the result of perception from all images of a recording. Raises RunError without a surface."""
     import numpy as np
 
     from palpate_models.scenario.load import exam_input

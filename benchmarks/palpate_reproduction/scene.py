@@ -12,10 +12,9 @@ from trimesh.creation import box
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.geometry import transform_matrix
-from palpate_dashboard import arrays, palette
-from palpate_dashboard.arrays import Carry
+from palpate_dashboard import palette
 from palpate_dashboard.replay import messages
-from palpate_dashboard.scene import SCENE
+from palpate_dashboard.scene import SCENE, Carry
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
@@ -101,7 +100,7 @@ def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]
 
 def deformation_mm(rest: Moment, pressed: Moment) -> float:
     """Return the largest displacement of a vertex of the abdomen [mm]."""
-    before, after = (arrays.triples(moment.surface.vertices) for moment in (rest, pressed))
+    before, after = (moment.surface.vertices.reshape(-1, 3) for moment in (rest, pressed))
     return float(1e3 * np.linalg.norm(after - before, axis=1).max())
 
 
@@ -112,8 +111,8 @@ class Stage:
         given = exam_input(scenario)
         self._X_WA = np.array(given.X_WA)
         self._links = visual_meshes(given.robot)
-        self._triangles = arrays.triples(rest.surface.triangles)
-        self._rest = arrays.triples(rest.surface.vertices).astype(np.float64)
+        self._triangles = rest.surface.triangles.reshape(-1, 3)
+        self._rest = rest.surface.vertices.reshape(-1, 3).astype(np.float64)
         self._still = [_box(part) for part in table.boxes(given.robot)]
 
     def bodies(self, moment: Moment) -> list[Body]:
@@ -128,11 +127,11 @@ class Stage:
         if known is not None and np.asarray(known.scanned).any():
             scanned, apparent = np.asarray(known.scanned, dtype=bool), np.asarray(known.apparent, dtype=np.float64)
             ratio = apparent / (known.background if known.background > 0 else float(np.median(apparent[scanned])))
-            places = apply(self._X_WA, arrays.triples(known.vertices).astype(np.float64))
+            places = apply(self._X_WA, known.vertices.reshape(-1, 3).astype(np.float64))
             shades = np.where(scanned, palette.stiffness_colors(ratio), skin)
             colors = Carry(places, self._rest, SCENE.carry_m)(shades, skin).astype(np.uint32)
         rgb = np.stack([(colors >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
-        vertices = arrays.triples(moment.surface.vertices).astype(np.float64)
+        vertices = moment.surface.vertices.reshape(-1, 3).astype(np.float64)
         return Body(vertices[self._triangles], rgb[self._triangles].mean(axis=1))
 
     def _robot(self, moment: Moment) -> list[Body]:

@@ -10,12 +10,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import Message
 from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame, quaternion, transform_matrix, vectors
 from palpate_dashboard import palette
-from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, transform, triples
 from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
 from palpate_models.patient.mesh import vertex_normals
 from palpate_models.robot import table
@@ -45,6 +45,36 @@ CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
 FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
 LAYERS: Final = ("mean", "band")
 """Layers of the map."""
+Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.integer[Any]]
+
+
+def cloud(message: Message) -> NDArray[np.float32]:
+    """Return the x y z of a PointCloud2 of 32-bit floats [m], shape (n, 3), without invalid points."""
+    offsets = {field.name: field.offset for field in message.fields}
+    layout = np.dtype({
+        "names": ["x", "y", "z"],
+        "formats": [">f4" if message.is_bigendian else "<f4"] * 3,
+        "offsets": [offsets[name] for name in "xyz"],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    rows = np.frombuffer(np.ascontiguousarray(message.data), dtype=layout, count=message.width * message.height)
+    xyz = np.stack((rows["x"], rows["y"], rows["z"]), axis=1).astype(np.float32)
+    return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])
+
+
+class Carry:
+    """Transfers values from the vertices of one mesh to those of another, from the nearest within a reach."""
+
+    def __init__(self, source: Floats, target: Floats, reach: float) -> None:
+        """`source` and `target`: vertex positions in one frame [m], shapes (n, 3) and (m, 3)."""
+        distance, index = cKDTree(source).query(target, k=1, workers=1)
+        self._index: NDArray[np.intp] = np.asarray(index)
+        self._within = np.asarray(distance) <= reach
+
+    def __call__(self, values: NDArray[Any], missing: Any) -> NDArray[Any]:
+        """Return `values`, shape (n,), at the target's vertices, shape (m,); `missing` without a source vertex in reach."""
+        return np.where(self._within, values[self._index], missing)
 
 
 @cache
@@ -90,7 +120,8 @@ class SceneView:
     def link_poses(self, t: int, message: Message, in_contact: bool, pressed_n: float) -> None:
         """Draw the links that have moved, the tool's path, and the contact force `pressed_n` [N] next to the tool."""
         for item in message.transforms:
-            link, pose = item.child_frame_id, transform(item.transform)
+            link, p, q = item.child_frame_id, item.transform.translation, item.transform.rotation
+            pose = np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
             for i, shape in enumerate(self._shapes.pop(link, ())):
                 self._canvas.log(f"world/robot/{link}/shape_{i}", shape)
             before = self._poses.get(link)
@@ -104,9 +135,9 @@ class SceneView:
 
     def abdomen(self, t: int, message: Message) -> None:
         """Draw the deformed surface; its triangles come with the first message only."""
-        vertices = triples(message.vertices)
+        vertices = message.vertices.reshape(-1, 3)
         if self._triangles is None:
-            self._triangles, self._rest = triples(message.triangles), vertices
+            self._triangles, self._rest = message.triangles.reshape(-1, 3), vertices
             skin = np.full(len(vertices), palette.pack(palette.SKIN), dtype=np.uint32)
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=self._triangles))
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=skin), t)
@@ -182,7 +213,7 @@ class SceneView:
 
     def perceived(self, t: int, message: Message) -> None:
         """Draw the perceived rest surface."""
-        vertices, triangles = triples(message.vertices), triples(message.triangles)
+        vertices, triangles = message.vertices.reshape(-1, 3), message.triangles.reshape(-1, 3)
         normals = vertex_normals(vertices, triangles)
         shape = rr.Mesh3D(
             vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=palette.POINTS

@@ -17,7 +17,7 @@ from palpate_bus.messages.geometry import pose_matrix, vectors
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_dashboard import arrays, plots, text
+from palpate_dashboard import plots, text
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots, depth_mm
 from palpate_dashboard.scene import MapView, SceneView
@@ -174,8 +174,8 @@ class DashboardService(Service):
         self._scene.link_poses(t, message, self._in_contact, self._pressed_n)
 
     def _phantom(self, t: int, message: Message) -> None:
-        vertices = arrays.triples(message.surface.vertices)
-        triangles = arrays.triples(message.surface.triangles)
+        vertices = message.surface.vertices.reshape(-1, 3)
+        triangles = message.surface.triangles.reshape(-1, 3)
         raised = vertices + ABOVE_SKIN_M * vertex_normals(vertices, triangles)
         ratio = np.asarray(message.stiffness) / np.asarray(message.background)
         lesion = np.asarray(message.lesion)
@@ -247,7 +247,7 @@ class DashboardService(Service):
         self._plots.log(t, "log/robot", self._robot, level)
 
     def _stiffness(self, t: int, message: Message) -> None:
-        vertices = arrays.triples(message.vertices)
+        vertices = message.vertices.reshape(-1, 3)
         reached, codes = np.asarray(message.scanned, dtype=bool), np.asarray(message.unassessed)
         scanned = reached & (codes == StiffnessMap.ASSESSED)
         self._unassessed = text.unassessed(codes[reached])
@@ -257,7 +257,7 @@ class DashboardService(Service):
         background = message.background if message.background > 0 else float(np.median(apparent[scanned]))
         ratio = apparent / background
         spread = half_width(message.lower, message.upper)
-        self._map.update(t, vertices, arrays.triples(message.triangles), ratio, spread, scanned)
+        self._map.update(t, vertices, message.triangles.reshape(-1, 3), ratio, spread, scanned)
         self._scene.stiffness(t, apply(self._X_WA, vertices.astype(np.float64)).astype(np.float32), ratio, scanned)
 
     def _findings(self, t: int, message: Message) -> None:

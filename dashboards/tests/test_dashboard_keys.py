@@ -19,7 +19,8 @@ from palpate_bus.messages import StiffnessMap
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator import OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
-from palpate_dashboard import arrays, replay, text
+from palpate_dashboard import replay, text
+from palpate_dashboard.scene import cloud
 from palpate_dashboard.sinks import Live
 from palpate_models.numerics.maps import level_lines
 
@@ -37,14 +38,14 @@ def test_level_lines_of_the_distance_are_circles(level: float) -> None:
 
 def test_a_cloud_with_padding_and_invalid_points() -> None:
     message = look(0)["perception/points"]
-    packed = arrays.cloud(message)
+    packed = cloud(message)
     assert len(packed) == message.width - 1
     wide = np.zeros((message.width, 20), dtype=np.uint8)
     wide[:, 4:16] = np.asarray(message.data).reshape(-1, 12)
     message.point_step, message.data = 20, wide.ravel()
     for field in message.fields:
         field.offset += 4
-    assert np.array_equal(arrays.cloud(message), packed)
+    assert np.array_equal(cloud(message), packed)
 
 
 def test_viewer_setting() -> None:

@@ -1,4 +1,4 @@
-"""Generators of the reference pages: each module has `page()`, which returns the Markdown of one page."""
+"""Generators of the reference pages: functions that return the Markdown of one page, named in docs/site.py."""
 
 from collections.abc import Iterable, Sequence
 

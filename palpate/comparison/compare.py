@@ -62,7 +62,7 @@ class ComparedPalpation(NamedTuple):
 def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None) -> ComparedPalpation:
     """Return the palpation of a results folder or a recording; of a recording, the forces at `depth_m` [m] if it is given.
 
-    Raises UserError if there is no map.
+    Raises UserError without a map.
     """
     at_depth = None
     faults: tuple[str, ...] = ()

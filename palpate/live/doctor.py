@@ -198,7 +198,7 @@ def doctor(
 ) -> None:
     """Check a live bus: versions, endpoints, shared memory, clocks, missing roles, and every topic against the contract.
 
-    The exit status is 0 when all is well, 1 when something is wrong, 2 when there is no bus.
+    The exit status is 0 when all is well, 1 when something is wrong, 2 without a bus.
     """
     with join_bus(connect, run, domain) as bus:
         if watch:

@@ -51,7 +51,7 @@ def step(ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milli
 def _request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
     """Send a request to one run, or to all, and print the answers.
 
-    Raises UserError if there is no such run, typer.Exit if a run does not answer.
+    Raises UserError for an unknown run, typer.Exit if a run does not answer.
     """
     console = SteadyConsole(stderr=True)
     failed = False

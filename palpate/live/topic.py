@@ -262,7 +262,7 @@ def _stamp_ns(received: ReceivedSample, topic: Topic) -> int | None:
 def plain(message: Any, *, full: bool, path: str | None = None) -> Any:
     """Return a message, or its field `path`, as values for YAML and JSON. Without `full` long arrays are shortened.
 
-    Raises NoBusError naming the fields when there is no such field.
+    Raises NoBusError naming the fields for an unknown one.
     """
     for name in (path or "").split(".") if path else []:
         names = [field.name for field in fields(message)] if is_dataclass(message) else []

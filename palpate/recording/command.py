@@ -1,12 +1,19 @@
 """`palpate assess`: a recording of any robot becomes a map, findings and a report."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from palpate.console import SteadyConsole, print_line, say
 from palpate_errors import ExitStatus
+
+if TYPE_CHECKING:
+    from palpate.recording.recording import PalpationRecording
+    from palpate.report.rows import Report
+    from palpate_conductor.collector import Collected
 
 
 def assess(
@@ -36,10 +43,7 @@ def assess(
     for fault in read.faults:
         say(fault.text)
     with results_folder(out, overwrite=overwrite) as folder:
-        gathered = collect_assessed(read)
-        from palpate.recording.written import write_assessed  # figures take memory that the assessment needs before
-
-        report, page = write_assessed(folder, read, gathered)
+        report, page = write_assessed(folder, read, collect_assessed(read))
     if as_json:
         print_line({"folder": str(out), **report.model_dump(mode="json")})
     else:
@@ -50,3 +54,43 @@ def assess(
         console.print(f"to read: {page}")
     if not report.assessed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
+
+
+def write_assessed(folder: Path, recording: PalpationRecording, gathered: Collected) -> tuple[Report, Path]:
+    """Write the results of a recording into a folder, as those of a run; return report and page."""
+    import numpy as np
+
+    from palpate.recording.assessed import region
+    from palpate.recording.faults import Remedy
+    from palpate.recording.recording import ContactKind
+    from palpate.report.page import write_page  # its figures take memory that the assessment needs before
+    from palpate.report.results import write_results
+    from palpate.report.rows import FaultRow, RecordedRow
+    from palpate_bus.runs.run_folder import name_run
+    from palpate_conductor.outcome import RunResult
+    from palpate_models.scenario.load import dump_scenario
+    from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
+    from palpate_models.section import Pose
+
+    samples = recording.samples()
+    centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
+    sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
+    smallest, largest = 1e-3, 1.0
+    exam = Exam(
+        pose=Pose(),
+        centre_m=centre,
+        region_m=tuple(np.clip(size, smallest, largest).tolist()),
+        depth_m=recording.depth_m if samples else Exam().depth_m,
+        spacing_m=max(spacing, smallest),
+        mode=Mode.CONTINUOUS if sliding else Mode.POINT,
+    )
+    scenario = Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
+    times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]
+    result = RunResult("recording", gathered, sim_time_s=max(times, default=0.0))
+    faults = [
+        FaultRow(code=f.code, count=f.count, of=f.of, text=f.text, refused=f.remedy is Remedy.REFUSED) for f in recording.faults
+    ]
+    name_run(folder)
+    (folder / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
+    recorded = RecordedRow(abdomen=recording.abdomen, faults=faults)
+    return write_results(folder, scenario, result, recorded), write_page(folder)

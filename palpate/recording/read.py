@@ -66,7 +66,7 @@ class ReadingLimits(NamedTuple):
     doubtful_frame_deg: float = 25.0
     """Angle between force and motion from which the frame is reported as doubtful."""
     wrong_frame_deg: float = 40.0
-    """Angle between force and motion from which there is no map."""
+    """Angle between force and motion from which no map is drawn."""
     force_n: tuple[float, float] = (0.01, 200.0)
     """Change of the force in a recording."""
     young_pa: tuple[float, float] = (50.0, 3e6)

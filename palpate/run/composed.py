@@ -121,7 +121,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     collected = Collector().collected
     start = 0.0
     trouble: list[str] = []
-    """Messages for the user so far, from the child and about what it waits for."""
+    """Messages for the user, from the child and about what it waits for."""
 
     def show(t: int) -> None:
         tell(RunProgress(t, t / NS / max(perf_counter() - start, 1e-9), collected, tuple(trouble)))

@@ -22,7 +22,7 @@ WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or r
 """The roles of every examination."""
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
 NONE = "none"
-"""`services.tissue: none`: there is no tissue service, since the tissue is real."""
+"""`services.tissue: none`: the tissue is real and has no service."""
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:

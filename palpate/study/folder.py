@@ -81,7 +81,7 @@ class Attempt(BaseModel):
 
     report: Report | None = None
     why: str | None
-    """Reason why there is no valid report, or why the examination was aborted; null for a completed one."""
+    """Reason for a missing or invalid report, or why the examination was aborted; null for a completed one."""
     code: str = ""
     """SHA-256 over the code that made the result (`code_digest`)."""
     peak_memory_bytes: int = 0
@@ -138,7 +138,7 @@ class RunRecord(BaseModel):
     digest: str | None
     """SHA-256 over the sorted pairs of case and run hash; null in wall-clock mode."""
     no_digest: str | None
-    """Reason why there is no digest."""
+    """Reason for a missing digest."""
     code: list[str]
     """SHA-256 of each version of the code that made cases. With more than one, figures mix versions."""
     platforms: list[dict[str, Any]]

@@ -107,7 +107,7 @@ class Method(Section):
     services: dict[str, str] = Field(default_factory=dict)
     """Implementation by role: an installed one, or a Python file; a relative path starts from the folder of the study's file."""
     runtime: Runtime = "lockstep"
-    """`wallclock`: one process per service, each on its own timer. Results depend on the machine, so there is no digest."""
+    """`wallclock`: one process per service, each on its own timer. Results depend on the machine, without a digest."""
     periods: dict[str, Annotated[int, Field(ge=1, le=1000)]] = Field(default_factory=dict)
     """Other periods of roles [ms], such as `control: 5`."""
 

@@ -119,7 +119,7 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
 
 
 def _against_the_method(cases: pd.DataFrame, lumps: pd.DataFrame) -> pd.DataFrame:
-    """Failed and not completed cases have the worst score, and a false alarm where there is no lump.
+    """Failed and not completed cases have the worst score, and a false alarm without a lump.
 
     What could be felt of the patient of a case without a result is taken from other cases of him; where there is none, all of
     his lumps count.

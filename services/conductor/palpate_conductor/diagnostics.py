@@ -67,7 +67,7 @@ class ContractWatch:
         return topic_statuses(monitor.health(), monitor.active.values(), monotonic())
 
     def violations(self, sender: str) -> list[SeenViolation]:
-        """Return the violations of a sender so far, the latest last."""
+        """Return the violations of a sender, the latest last."""
         found = (seen for seen in self._live.monitor.active.values() if seen.violation.sender == sender)
         return sorted(found, key=lambda seen: seen.last)
 

@@ -128,9 +128,9 @@ class RunProgress(NamedTuple):
     real_time_factor: float
     collected: Collected
     trouble: tuple[str, ...] = ()
-    """Messages for the user so far, see `RunResult`."""
+    """Messages for the user, see `RunResult`."""
     request: Callable[[int, str], None] | None = None
-    """Sends an operator's request with its reason; None where there is no bus."""
+    """Sends an operator's request with its reason; None without a bus."""
 
 
 Tell = Callable[[RunProgress], None]

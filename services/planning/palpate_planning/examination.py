@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,6 @@ from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
-from palpate_planning.views import Remainder, Views
 from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits
 from palpate_planning.wall.wall import Wall, plane
 
@@ -33,6 +33,8 @@ from palpate_planning.wall.wall import Wall, plane
 class ExamTuning(NamedTuple):
     """Limits of repetition and time of the phases."""
 
+    looks_max: int = 3
+    """Maximum number of postures to look from."""
     rescans_max: int = 2
     """Maximum number of repeated views of the surface, after the patient moved or no tissue was felt."""
     replans_max: int = 3
@@ -51,6 +53,55 @@ class ExamTuning(NamedTuple):
 
 
 EXAM = ExamTuning()
+
+
+class Views:
+    """The views of the abdomen: postures, tried in turn, and the bursts of the camera."""
+
+    def __init__(self, postures: list[Array]) -> None:
+        """`postures` [rad], shape (n,) each."""
+        self.postures = postures
+        self.failed = 0
+        """Number of views that failed."""
+        self.asked: int | None = None
+        """When the camera was asked for the burst that perception is to answer [ns]."""
+
+    @property
+    def posture(self) -> Array:
+        """The posture to look from [rad], shape (n,)."""
+        return self.postures[self.failed]
+
+    def fail(self) -> bool:
+        """Turn to the next posture; return True if none is left."""
+        self.asked = None
+        self.failed += 1
+        return self.failed >= min(EXAM.looks_max, len(self.postures))
+
+    def restart(self) -> None:
+        """Begin with the first posture again."""
+        self.asked, self.failed = None, 0
+
+
+@dataclass
+class Remainder:
+    """The part of the examination that is planned, and planned again after an interruption."""
+
+    wanted: frozenset[int] | None = None
+    """Targets to examine; None: all."""
+    bend: float | None = None
+    """Minimum bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
+    rescans: int = 0
+    """Number of new views because the patient moved, or no tissue was felt."""
+    looked_again: bool = False
+    """True if no tissue was felt before one of them."""
+    replans: int = 0
+    unplanned: str = ""
+    """Text of the failure to plan the rest; empty if there was none."""
+
+    @property
+    def begun(self) -> bool:
+        """True if strokes were carried out before."""
+        return self.rescans + self.replans > 0
 
 
 class ExaminationSequence:
@@ -181,7 +232,7 @@ class ExaminationSequence:
             self._course.enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
 
     def _at_home(self, now: Observation) -> bool:
-        """Move home; return True once there. Abort if there is no path."""
+        """Move home; return True once there. Abort without a path."""
         course = self._course
         try:
             return course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived)

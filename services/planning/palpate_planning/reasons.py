@@ -78,7 +78,7 @@ _LOSSES: Final = {
 
 
 class Cause(NamedTuple):
-    """A reason, its text, and the role or topic behind it if one is known. False if there is no reason."""
+    """A reason, its text, and the role or topic behind it if one is known. False without a reason."""
 
     reason: Reason = Reason.NONE
     text: str = ""

@@ -75,7 +75,7 @@ class _Broken:
     """The files of a truncated recording, oldest first, and their channels."""
 
     def __init__(self, path: Path) -> None:
-        """`path`: a folder or a file. Raises FileNotFoundError if there is no file."""
+        """`path`: a folder or a file. Raises FileNotFoundError without one."""
         self.files = [path] if path.is_file() else sorted(path.glob("*.mcap"), key=_number)
         if not self.files:
             raise FileNotFoundError(f"{path}: no recording there; give an .mcap file, or the folder that holds it")
