@@ -176,14 +176,6 @@ def number(value: float | None, unit: str = "", digits: int = 4) -> str:
     return "-" if value is None else f"{value:.{digits}g}{' ' if unit else ''}{unit}"
 
 
-def bandwidth(bytes_per_s: float) -> str:
-    """Return a bandwidth in B/s, kB/s or MB/s."""
-    for factor, unit in ((1e6, "MB/s"), (1e3, "kB/s")):
-        if bytes_per_s >= factor:
-            return f"{bytes_per_s / factor:.4g} {unit}"
-    return f"{bytes_per_s:.0f} B/s"
-
-
 class CaseDisplay(progress.Progress):
     """A bar over many cases on a terminal; one line per case otherwise; nothing when quiet."""
 

@@ -46,7 +46,7 @@ from palpate_bus.messages.geometry import (
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.kinematics import link_transforms
+from palpate_models.robot.arm import link_transforms
 from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000

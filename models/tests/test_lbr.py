@@ -9,9 +9,8 @@ import pytest
 import trimesh
 
 from palpate_models.robot import arm as robot_arm, lbr
-from palpate_models.robot.arm import TOOL, link_names, urdf
+from palpate_models.robot.arm import TOOL, link_names, link_transforms, tool_pose, urdf
 from palpate_models.robot.chain import Capsule
-from palpate_models.robot.kinematics import link_transforms, tool_pose
 from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot

@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from palpate_errors import UserError
-from palpate_models.robot.arm import arm_of, urdf
-from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose, urdf
 from palpate_models.robot.urdf_arm import enclosing_capsule, read_arm
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot

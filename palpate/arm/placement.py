@@ -1,21 +1,32 @@
-"""Optimal pose of the robot's base: x, y, height and yaw, together with a posture for each of a grid of targets.
+"""The place of an arm: where its base should stand, and what its shapes touch.
 
-The targets cover the examined region of the abdomen and a border around it, in contact and raised along their normals, for
-approach and retreat, other patients and registration errors.
+The optimal pose of the base is its x, y, height and yaw, together with a posture for each of a grid of targets. They cover the
+examined region of the abdomen and a border around it, in contact and raised along their normals, for approach and retreat, other
+patients and registration errors.
 """
 
+from functools import cache
 from operator import itemgetter
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, Mask, apply, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.arm import arm_of
-from palpate_models.robot.table import BASE_SIDE_M, TABLE
+from palpate_models.robot.chain import Arm
+from palpate_models.robot.fitting import ready_postures
+from palpate_models.robot.table import BASE_SIDE_M, TABLE, boxes
+from palpate_models.robot.urdf_arm import flange_advice, home_advice
+from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file, arm_path
 from palpate_models.scenario.load import true_pose
-from palpate_models.scenario.schema import Exam, Robot, Scenario
+from palpate_models.scenario.schema import Exam, Limits, Robot, Scenario
+from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.placement.redundancy import POSTURES, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
@@ -147,3 +158,61 @@ def describe(robot: Robot, postures: PostureSequence) -> str:
         f"largest torque {100 * postures.torque_fraction[reached].max():.0f} % of its limit, "
         f"minimum dexterity {postures.dexterity[reached].min():.2f}"
     )
+
+
+def home_origin(name: str) -> str:
+    """Return a text on a home posture that the arm's file does not have; empty if it has one."""
+    missing = name != DEFAULT_ARM and arm_file(name).home_rad is None
+    return f"sought, as {arm_path(name).name} has none" if missing else ""
+
+
+def flange_note(name: str, found: Arm) -> str:
+    """Return what to write if the flange's z does not point out of the arm; empty if it does."""
+    if name == DEFAULT_ARM:
+        return ""
+    return flange_advice(found, arm_file(name)).replace("the YAML file", arm_path(name).name)
+
+
+def advice(name: str, robot: Robot | None = None) -> str:
+    """Return what to write where an arm touches itself at home, or the surroundings of `robot`."""
+    found = arm_of(robot or Robot(arm=name))
+    if name == DEFAULT_ARM:
+        return "move the base by hand"
+    if wrong := flange_note(name, found):
+        return wrong
+    for home in ready_postures(found):
+        if not touching(name, home, robot):
+            return f"write `home_rad: {home.tolist()}` in {arm_path(name).name}, which is clear"
+    return home_advice(found, arm_file(name)).replace("the YAML file", arm_path(name).name)
+
+
+def touching(name: str, q: Array, at: Robot | None = None) -> list[str]:
+    """Return the pairs of shapes of an arm, tool included, that are too close at `q` [rad], wherever its base stands.
+
+    With `at`, also those of the arm and the table or base there.
+    """
+    robot = at or Robot(arm=name)
+    found = _scene(robot).collisions(q)
+    return [pair for pair in found if at is not None or not any(pair.endswith(box.name) for box in boxes(robot))]
+
+
+@cache
+def _scene(robot: Robot) -> CollisionScene:
+    return CollisionScene(ArmKinematics(robot, Limits()), robot)
+
+
+def draw_reach(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:
+    """Draw the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
+    figure = Figure(figsize=(6.5, 6.5), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    width, length = TABLE.x_m[1] - TABLE.x_m[0], TABLE.y_m[1] - TABLE.y_m[0]
+    axes.add_patch(Rectangle((TABLE.x_m[0], TABLE.y_m[0]), width, length, fill=False, color="#7a8c94", label="table"))
+    corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
+    axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
+    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "out of reach")):
+        if chosen.any():
+            axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
+    title = f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets"
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal", ylim=(-0.6, 0.6))
+    axes.legend()
+    figure.savefig(path)

@@ -10,9 +10,10 @@ from time import monotonic, sleep
 from typing import Annotated, Any, Final, NamedTuple, NoReturn
 
 import typer
+from rich.filesize import decimal
 from rich.text import Text
 
-from palpate.console import SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
+from palpate.console import SteadyConsole, number, print_json, print_line, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, join_bus
 from palpate_bus.contract import contract
@@ -267,6 +268,7 @@ def _row(health: TopicHealth) -> tuple[str | Text, ...]:
     return (
         topic.name, ", ".join(health.senders), state, number(health.rate_hz) if periodic else "",
         number(health.bus_rate_hz) if periodic and health.bus_rate_hz is not None else "", wanted,
-        number(health.age_ms, "ms", 2) if periodic else "", bandwidth(health.bytes_per_s) if health.bytes_per_s else "",
+        number(health.age_ms, "ms", 2) if periodic else "",
+        f"{decimal(round(health.bytes_per_s))}/s" if health.bytes_per_s else "",
         str(health.messages) if health.messages else "", str(health.missing) if health.missing else "",
     )  # fmt: skip

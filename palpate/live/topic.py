@@ -12,9 +12,10 @@ import numpy as np
 import typer
 import yaml
 import zenoh
+from rich.filesize import decimal
 from rich.text import Text
 
-from palpate.console import bandwidth, print_json, print_line, say, table, wide_console
+from palpate.console import print_json, print_line, say, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
 from palpate_bus.contract import Topic, contract
@@ -178,7 +179,7 @@ def bw(
                 print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
             else:
                 size = f"{mean:.0f} B per message, {min(sizes, default=0)} to {max(sizes, default=0)}"
-                print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
+                print(f"{decimal(round(rate))}/s; {size}; {len(sizes)} messages", flush=True)
 
 
 def every_sender(session: zenoh.Session, topic: Topic, domain: int) -> Subscription:

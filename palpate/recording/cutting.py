@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, find_objects, label, median_filter
+from scipy.signal import find_peaks
 
 from palpate.recording.motion import TUNING
 from palpate_models.numerics.frames import Array
@@ -118,19 +119,8 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
 
 def peaks(values: Array, min_rise: float) -> tuple[NDArray[np.intp], Array]:
     """Return the maxima that rise by `min_rise` over the minima on both sides: their indices, and the lesser rise; shape (k,)."""
-    turns: list[tuple[int, float]] = []  # minima and maxima in turn, from a minimum to a minimum
-    sign, at, extreme = -1.0, 0, np.inf
-    for k, value in enumerate(values.tolist()):
-        if sign * (value - extreme) > 0:
-            at, extreme = k, value
-        elif sign * (extreme - value) >= min_rise:
-            turns.append((at, extreme))
-            sign, at, extreme = -sign, k, value
-    if sign < 0:
-        turns.append((at, extreme))
-    index, height = np.array(turns).T
-    lesser = np.minimum(height[1::2] - height[:-1:2], height[1::2] - height[2::2])
-    return index[1::2].astype(int), lesser
+    at, found = find_peaks(values, prominence=min_rise)
+    return at, found["prominences"]
 
 
 def _split(one: slice, at: NDArray[np.intp]) -> list[slice]:

@@ -10,9 +10,8 @@ from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Qua
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import MS, duration_message, header, nanoseconds
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import arm_of
+from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose
 from palpate_models.robot.chain import Arm
-from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 
 COMMAND = "control/joint_torque"

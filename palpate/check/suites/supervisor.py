@@ -10,8 +10,7 @@ from palpate.check.shapes import level
 from palpate.exam_state import exam_state
 from palpate_bus.messages import MS, NS, ExamState, OperatorRequest, RobotStatus, SupervisorState, header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
-from palpate_models.robot.arm import arm_of, urdf
-from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose, urdf
 from palpate_models.scenario.load import exam_input
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"

@@ -11,8 +11,7 @@ from palpate_bus.messages import Clock, DiagnosticArray, ExamState, Quaternion, 
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import MS, NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.robot.arm import arm_of
-from palpate_models.robot.kinematics import link_transforms
+from palpate_models.robot.arm import arm_of, link_transforms
 from palpate_models.scenario.schema import ExamInput
 
 _FIRST_JOINT = 1

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.robot.arm import capsules
-from palpate_models.robot.kinematics import link_transforms
+from palpate_models.robot.arm import capsules, link_transforms
 from palpate_models.robot.table import TABLE
 from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall

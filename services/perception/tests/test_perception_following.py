@@ -8,7 +8,7 @@ import pytest
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.numerics.frames import apply, inverse
-from palpate_models.robot.kinematics import tool_pose
+from palpate_models.robot.arm import tool_pose
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot

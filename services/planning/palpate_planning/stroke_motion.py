@@ -6,8 +6,7 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import arm_of
-from palpate_models.robot.kinematics import tool_pose
+from palpate_models.robot.arm import arm_of, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement

@@ -11,7 +11,7 @@ import pytest
 from planning_fakes import BASE, PERIOD_S, known
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.robot.kinematics import tool_pose
+from palpate_models.robot.arm import tool_pose
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot
 from palpate_planning.contact import ContactMeasurement

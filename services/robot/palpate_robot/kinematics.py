@@ -7,7 +7,7 @@ With X_WL the pose of link i behind joint i, a its axis, r the vector from the j
     tau_g = a_W . (r x (0, 0, m g))                                         (torque that supports the mass m behind a joint)
 
 DART computes the same, but through its Python binding a call takes five times as long, and the poses of all links twenty times.
-`palpate_models.robot.kinematics` is the same in numpy; tests compare them.
+`palpate_models.robot.arm` is the same in numpy; tests compare them.
 """
 
 from math import cos, sin, sqrt

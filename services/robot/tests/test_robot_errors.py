@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import urdf
-from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.robot.arm import tool_jacobian, tool_pose, urdf
 from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import Robot, Scenario

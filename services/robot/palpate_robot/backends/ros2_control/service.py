@@ -13,8 +13,7 @@ from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_models.numerics.frames import Array, rigid
-from palpate_models.robot.arm import TOOL, arm_of, base_pose
-from palpate_models.robot.kinematics import tool_pose
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
