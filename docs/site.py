@@ -31,8 +31,8 @@ GENERATED = {
     "docs/settings.md": "reference:settings",
     "docs/fault-tables.md": "faults:page",
     "docs/validation.md": "reference:validation",
-    "docs/errors.md": "errors:page",
-    "docs/scenario.md": "scenario:page",
+    "docs/errors.md": "scenario:errors",
+    "docs/scenario.md": "scenario:scenario",
     "docs/reference/commands.md": "commands:page",
     "docs/reference/messages.md": "reference:messages",
 }

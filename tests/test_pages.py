@@ -255,11 +255,11 @@ def test_every_column_of_the_samples_is_documented() -> None:
 
 def test_the_reference_pages_describe_every_topic_command_and_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    from generate import commands, errors, faults, reference, scenario, topics
+    from generate import commands, faults, reference, scenario, topics
 
-    pages = [module.page() for module in (commands, errors, faults, scenario, topics)]
-    pages += [reference.messages(), reference.settings(), reference.validation()]
+    pages = [module.page() for module in (commands, faults, topics)]
+    pages += [scenario.errors(), scenario.scenario(), reference.messages(), reference.settings(), reference.validation()]
     assert all(page.startswith("# ") for page in pages)
     assert all(f"### palpate {word}" in pages[0] for word in COMMANDS)
     assert all(f"| `{variable(name)}` |" in pages[6] for name in Settings.model_fields)
-    assert all(f"### `{topic}`\n" in pages[4] for topic in contract().topics)
+    assert all(f"### `{topic}`\n" in pages[2] for topic in contract().topics)

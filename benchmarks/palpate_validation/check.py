@@ -77,12 +77,12 @@ STYLE: Any = {
 }
 
 
-def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.2), dpi: int = 90) -> None:
+def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.2)) -> None:
     """Draw and write a PNG; `size_in` [inch]. The folder must exist."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=size_in, layout="constrained")
         draw(figure)
-        figure.savefig(path, dpi=dpi, metadata={"Software": None})
+        figure.savefig(path, dpi=90, metadata={"Software": None})
 
 
 MARKS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}

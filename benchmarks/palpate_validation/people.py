@@ -72,9 +72,9 @@ def _flat(k_w_n_per_m3: float) -> PhantomModel:
     return flat_phantom(PRESS.half_m, PRESS.edge_m, k_w_n_per_m3)
 
 
-def at_depths(force: Array, zero_offset_m: float, depths: Array = COMPARED_M) -> Array:
-    """Return a simulated `force` at depths [m] measured from `zero_offset_m` [m] below the skin."""
-    return np.interp(depths + zero_offset_m, np.arange(len(force)) * PRESS.spacing_m, force)
+def at_depths(force: Array, zero_offset_m: float) -> Array:
+    """Return a simulated `force` at `COMPARED_M`, measured from `zero_offset_m` [m] below the skin."""
+    return np.interp(COMPARED_M + zero_offset_m, np.arange(len(force)) * PRESS.spacing_m, force)
 
 
 class PeopleBounds(NamedTuple):

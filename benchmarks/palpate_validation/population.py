@@ -69,7 +69,7 @@ def read_measured() -> pd.DataFrame:
     return sample_of([remus2024.PEOPLE.index(person) for _, person in places], force)
 
 
-def sample_persons(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> pd.DataFrame:
+def sample_persons(persons: int = SETUP.persons) -> pd.DataFrame:
     """Return persons of the seeds 0, 1, 2 .., each pressed at `SETUP.places` random positions of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
@@ -79,7 +79,7 @@ def sample_persons(persons: int = SETUP.persons, build: Build = Build.MEDIAN) ->
     offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))
     force = []
     for seed in range(persons):
-        phantom = draw_person(Phantom(kind="person", build=build), seed)
+        phantom = draw_person(Phantom(kind="person", build=Build.MEDIAN), seed)
         assert phantom.anatomy is not None
         usual = phantom.stiffness
         at = _places(belly(phantom.size_m, phantom.anatomy), generator(seed, "places"))

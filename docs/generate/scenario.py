@@ -1,4 +1,4 @@
-"""docs/scenario.md, from the fields of a scenario."""
+"""docs/scenario.md and docs/errors.md, from the fields of a scenario and the table in `error_levels.yaml`."""
 
 import json
 from collections.abc import Iterator
@@ -6,6 +6,7 @@ from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
 from generate import one_line, table
+from palpate_models.scenario.errors import LEVEL, Errors, table as levels
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import UNITS, Section
 
@@ -31,8 +32,8 @@ _ELSEWHERE: Final = {
 _BOUNDS: Final = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
 
 
-def page() -> str:
-    """Return the page."""
+def scenario() -> str:
+    """Return docs/scenario.md."""
     units = ", ".join(f"`_{end}` {unit}" for end, unit in UNITS.items())
     return _HEAD.format(units=fill(f"A field's name ends with its unit: {units}.", 128)) + "".join(
         _section("", Scenario, Scenario())
@@ -99,3 +100,52 @@ def _values(schema: dict[str, Any], parts: dict[str, Any]) -> str:
 
 def _anchor(path: str) -> str:
     return path.replace(".", "").replace("[]", "")
+
+
+_ERRORS: Final = f"""# Errors of sensors, calibrations and arm
+
+Generated from [`errors.py`](../models/palpate_models/scenario/errors.py) and
+[`error_levels.yaml`](../models/palpate_models/error_levels.yaml) by `make docs`.
+
+    palpate run --set errors=typical                              a level: none, typical or poor; {LEVEL} is the default
+    palpate run --set errors=poor --set errors.force.tare_n=0.1   a level, and one field changed
+
+For each patient one set of equipment is drawn from the scenario's seed. The errors below are standard deviations or bounds of
+that draw, as each field says. The simulated robot, tool, sensor and camera, and the true pose of the patient, have these errors.
+Control, planning, perception, assessment and supervisor use the nominal equipment, as on hardware, and get neither the errors nor
+the seed. Drivers of real hardware (`lbr`, `ros`) ignore this section; the emulator of the LBR uses it.
+
+The level `none` is an ideal world for tests. It keeps the white noise of good sensors, and the constant bias of a force/torque
+sensor, which every examination tares. `offset` of a pose adds a chosen error to the drawn one.
+
+Marks of certainty: V read in the source (mostly abstracts and issue threads; "name #n" is an issue of that repository), S
+second-hand, C computed for this project, A assumed. A mark in brackets inside a source applies to the words before it.
+
+Not modelled: a tool mounted at an angle, bent joint axes, motor dynamics of a flexible joint, distortion of the camera's lens,
+depth errors that grow with distance, hysteresis of the force/torque sensor.
+"""
+
+
+def errors() -> str:
+    """Return docs/errors.md."""
+    return _ERRORS + "".join(_error_sections())
+
+
+def _error_sections() -> Iterator[str]:
+    nominal = Errors(level="none")
+    for name, rows in levels().items():
+        section = getattr(nominal, name)
+        yield f"\n## `errors.{name}`\n\n{one_line(Errors.model_fields[name].description or type(section).__doc__ or '')}\n\n"
+        yield table(
+            ("field", "meaning", "none", "typical", "poor", "mark", "source"),
+            [
+                (
+                    f"`{field}`",
+                    type(section).model_fields[field].description or "",
+                    *(f"{value:g}" for value in (getattr(section, field), row["typical"], row["poor"])),
+                    row["mark"],
+                    row["source"],
+                )
+                for field, row in rows.items()
+            ],
+        )

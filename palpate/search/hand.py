@@ -9,8 +9,8 @@ from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
-from palpate.quick.errors import Loop, LoopErrors, loop_errors
-from palpate.quick.felt import FeltPatient, felt_patient
+from palpate.quick.errors import Loop, loop_errors
+from palpate.quick.felt import FeltPatient
 from palpate.quick.patient import PERIOD_S, Patient
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
@@ -51,8 +51,8 @@ class Hand(Protocol):
 class _Timed:
     """Errors of the examination and elapsed time, common to both hands."""
 
-    def __init__(self, scenario: Scenario, errors: LoopErrors | None) -> None:
-        self._errors = errors or loop_errors(scenario)
+    def __init__(self, scenario: Scenario) -> None:
+        self._errors = loop_errors(scenario)
         self._reported_sd_m = self._errors.uncertainty_m
         self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._reported_sd_m)
         self._loop = Loop(scenario, self._errors)
@@ -79,9 +79,9 @@ class _Timed:
 class PatientHand(_Timed):
     """Presses the true tissue."""
 
-    def __init__(self, scenario: Scenario, errors: LoopErrors | None = None) -> None:
-        """`errors`: None for those of loop.yaml. Raises what `Patient` does, and UnknownLoopError without fitted errors."""
-        super().__init__(scenario, errors)
+    def __init__(self, scenario: Scenario) -> None:
+        """Raises what `Patient` does, and UnknownLoopError without fitted errors."""
+        super().__init__(scenario)
         self.patient = Patient(scenario, time=self._loop.begin_s)
         self._begin_s = self._loop.begin_s
         self._breathing = self.patient.surface.between(self.patient.tissue.model.breathing)
@@ -127,10 +127,10 @@ class PatientHand(_Timed):
 class SurrogateHand(_Timed):
     """Scales the standard press's apparent stiffness; without relaxation, friction or memory of earlier presses."""
 
-    def __init__(self, scenario: Scenario, errors: LoopErrors | None = None, felt: FeltPatient | None = None) -> None:
-        """`errors` as for `PatientHand`; `felt`: apparent stiffness of the patient, computed if None."""
-        super().__init__(scenario, errors)
-        self.felt = felt or felt_patient(scenario.phantom, scenario.seed)
+    def __init__(self, scenario: Scenario, felt: FeltPatient) -> None:
+        """`felt`: apparent stiffness of the patient."""
+        super().__init__(scenario)
+        self.felt = felt
         self._breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
         self._rng = generator(scenario.seed, "surrogate")
         self._exponent = float(self._rng.normal(*_EXPONENT))

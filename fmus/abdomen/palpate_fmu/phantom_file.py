@@ -60,15 +60,15 @@ def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
     return values
 
 
-def sample_vertices(model: PhantomModel, count: int = SAMPLES) -> NDArray[np.int32]:
-    """Vertices spread evenly over the examined front, the one at the umbilicus first: farthest-point sampling, (count,)."""
+def sample_vertices(model: PhantomModel) -> NDArray[np.int32]:
+    """Vertices spread evenly over the examined front, the one at the umbilicus first: farthest-point sampling, (SAMPLES,)."""
     x, y = model.vertices[:, 0], model.vertices[:, 1]
     front = ~model.fixed & (model.normals[:, 2] > 0) & (np.maximum(np.abs(x), np.abs(y)) <= SAMPLED_HALF_M)
     pool = np.flatnonzero(front if front.any() else ~model.fixed)
     points = model.vertices[pool]
     chosen = [int(np.hypot(points[:, 0], points[:, 1]).argmin())]
     away = np.full(len(pool), np.inf)
-    while len(chosen) < min(count, len(pool)):
+    while len(chosen) < min(SAMPLES, len(pool)):
         away = np.minimum(away, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
         chosen.append(int(away.argmax()))
     return np.asarray(pool[chosen], dtype=np.int32)

@@ -31,6 +31,8 @@ class DetectabilityTuning(NamedTuple):
     prior_sd: float = 10.0
     """Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all,
     the likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+    bins: int = 6
+    """Bins of equal number in plots."""
     min_lumps: int = 10
     """Minimum numbers of found and of missed lumps for a fit."""
 
@@ -180,12 +182,12 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
     return np.append(done.x[:k], lapse), 2 * float(done.fun)
 
 
-def observe_shares(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -> list[tuple[float, Estimate]]:
+def observe_shares(variant: Variant, name: str, bootstrap: Bootstrap) -> list[tuple[float, Estimate]]:
     """Return the share of found lumps in bins of equal number over the covariate `name`, with the mean of each bin."""
     lumps = variant.lumps.dropna(subset=[name])
     if lumps.empty:
         return []
-    edges = pd.qcut(lumps[name].astype(float), bins, labels=False, duplicates="drop")
+    edges = pd.qcut(lumps[name].astype(float), FIT.bins, labels=False, duplicates="drop")
     parts = [part for _, part in lumps.groupby(edges)]
     return [(float(part[name].mean()), bootstrap.share(part["found"], part["patient"], "lumps")) for part in parts]
 

@@ -153,13 +153,14 @@ class Collector(Service):
 
     role = "conductor"
 
-    def __init__(self, diagnose: Callable[[], Sequence[Any]] | None = None, tree: FrameTree | None = None) -> None:
-        """`diagnose` returns the statuses for `diagnostics`; without `tree` no `tf` is published."""
+    def __init__(self, tree: FrameTree | None = None) -> None:
+        """Without `tree` no `tf` is published."""
         self._exam_states, self._indentation, self._motions = map(
             KeptMessages, ("exam/state", "truth/indentation", "perception/motion")
         )
         self.collected = Collected(self._exam_states, self._indentation, self._motions)
-        self.diagnose = diagnose
+        self.diagnose: Callable[[], Sequence[Any]] | None = None
+        """Returns the statuses for `diagnostics`."""
         self._tree = tree
         self._sampled = False
         """True once there are samples of this run; those of a resumed one have negative stamps."""

@@ -187,18 +187,16 @@ def _flat(vectors: Array) -> NDArray[np.float32]:
 
 
 def simulated(
-    scenario: Scenario,
-    make: Callable[[PhantomModel, BreathingCurve, float], tuple[TissueBackend, Mapping[str, Any]]],
-    service: type[TissueService] = TissueService,
+    scenario: Scenario, make: Callable[[PhantomModel, BreathingCurve, float], tuple[TissueBackend, Mapping[str, Any]]]
 ) -> Service:
     """Return the tissue of a scenario, on its moving body. Besides scoring, this is the only role that gets the phantom.
 
-    `make` returns the physics of a phantom that breathes, in steps of a period [s], and facts for log and report. `service` may
-    be a subclass that sends more topics. Raises PluginError if it cannot simulate this phantom.
+    `make` returns the physics of a phantom that breathes, in steps of a period [s], and facts for log and report. Raises
+    PluginError if it cannot simulate this phantom.
     """
     model, breathing = build_phantom(scenario.phantom, scenario.seed), BreathingCurve(scenario.phantom.breathing, scenario.seed)
     try:
         backend, facts = make(model, breathing, contract().roles[TissueService.role].period / NS)
     except UserError as error:
         raise PluginError(f"services.tissue = {scenario.services.tissue}: {error}") from error
-    return carry(service(backend, model, true_pose(scenario), facts), scenario)
+    return carry(TissueService(backend, model, true_pose(scenario), facts), scenario)

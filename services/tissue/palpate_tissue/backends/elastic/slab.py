@@ -5,14 +5,12 @@ slab.press(radius_m=0.02, depth_m=0.005)
 """
 
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
-from palpate_models.patient.schema import Lesion
 from palpate_tissue.backends.elastic.compliance import COMPLIANCE, YOUNG_OVER_K_W, Compliance, compliance
 from palpate_tissue.backends.elastic.patch import ContactSolver
 
@@ -23,23 +21,20 @@ class FlatSlab:
     """A flat layer of skin vertices on a hexagonal lattice, elastic and instantaneous; half-space when `thickness_m` is infinite.
 
     The skin continues beyond the lattice but cannot be touched there: choose `half_m` larger than the contact radius.
-    Lesions need a finite thickness.
     """
 
     def __init__(
         self,
         young_pa: float = 1e4,
-        poisson: float = COMPLIANCE.poisson,
         thickness_m: float = math.inf,
         half_m: float = 0.025,
         edge_m: float = 0.0015,
-        lesions: Sequence[Lesion] = (),
         pitch_m: float = 0.010,
     ) -> None:
         self.young_pa = young_pa
-        self.poisson = poisson
+        self.poisson = COMPLIANCE.poisson
         self.model: PhantomModel = flat_phantom(half_m, edge_m, young_pa / YOUNG_OVER_K_W)
-        self.compliance: Compliance = compliance(self.model, lesions, thickness_m, poisson, pitch_m)
+        self.compliance: Compliance = compliance(self.model, (), thickness_m, pitch_m=pitch_m)
         self._matrix: Array = self.compliance.matrix.astype(np.float64)
 
     @property
