@@ -27,22 +27,18 @@ if TYPE_CHECKING:
     from palpate_models.scenario.load import ScenarioError as ScenarioError
     from palpate_models.scenario.schema import Scenario as Scenario
 
-_HOMES = {
-    "Assessment": "palpate.interface.assessment",
-    "Examination": "palpate.interface.examination",
-    "Patient": "palpate.quick.patient",
-    "PalpationRecording": "palpate.recording.recording",
-    "Scenario": "palpate_models.scenario.schema",
-    "ScenarioError": "palpate_models.scenario.load",
-    "StiffnessMap": "palpate.interface.assessment",
-    "StudyResult": "palpate.interface.studies",
-    "Touch": "palpate.quick.patient",
-    "assess": "palpate.interface.assessment",
-    "read_recording": "palpate.recording.read",
-    "run": "palpate.interface.examination",
-    "scenario": "palpate.interface.scenarios",
-    "study": "palpate.interface.studies",
+_NAMES = {
+    "palpate.interface.assessment": ("Assessment", "StiffnessMap", "assess"),
+    "palpate.interface.examination": ("Examination", "run"),
+    "palpate.interface.scenarios": ("scenario",),
+    "palpate.interface.studies": ("StudyResult", "study"),
+    "palpate.quick.patient": ("Patient", "Touch"),
+    "palpate.recording.read": ("read_recording",),
+    "palpate.recording.recording": ("PalpationRecording",),
+    "palpate_models.scenario.load": ("ScenarioError",),
+    "palpate_models.scenario.schema": ("Scenario",),
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
 """The module of each name of the interface."""
 __all__ = [*_HOMES]  # noqa: PLE0604
 

@@ -32,16 +32,9 @@ ATTEMPTS: Final = 3
 """A case that fails this often is reported as failed."""
 NO_DIGEST: Final = "examinations in wall-clock mode depend on the machine and its load, so they have no digest"
 PACKAGES: Final = (
-    "palpate.quick",
-    "palpate.run",
-    "palpate.truth",
-    "palpate.report",
-    "palpate_bus",
-    "palpate_models",
-    "palpate_conductor",
-    "palpate_fmu",
-    *(f"palpate_{role}" for role in WORKERS),
-)
+    "palpate.quick", "palpate.run", "palpate.truth", "palpate.report", "palpate_bus", "palpate_models", "palpate_conductor",
+    "palpate_fmu", *(f"palpate_{role}" for role in WORKERS),
+)  # fmt: skip
 """Packages whose code decides results."""
 HASH: Final = "sha256"
 """Field of an outcome's file: SHA-256 over the other fields."""

@@ -29,17 +29,11 @@ from numpy.typing import ArrayLike, NDArray
 from palpate_fmu.reading import FmuError, FmuVariable, binary_folders, list_names, read_description, read_scalars, read_variables
 
 _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
-    "Float64": ("Float64", None, np.float64),
+    **{
+        name: (name, None, np.dtype(name.lower()).type)
+        for name in ("Float64", "Float32", *(f"{sign}{bits}" for bits in (8, 16, 32, 64) for sign in ("Int", "UInt")))
+    },
     "Real": ("Float64", "Real", np.float64),
-    "Float32": ("Float32", None, np.float32),
-    "Int8": ("Int8", None, np.int8),
-    "UInt8": ("UInt8", None, np.uint8),
-    "Int16": ("Int16", None, np.int16),
-    "UInt16": ("UInt16", None, np.uint16),
-    "Int32": ("Int32", None, np.int32),
-    "UInt32": ("UInt32", None, np.uint32),
-    "Int64": ("Int64", None, np.int64),
-    "UInt64": ("UInt64", None, np.uint64),
     "Integer": ("Int32", "Integer", np.int32),
     "Enumeration": ("Int64", "Integer", np.int64),
     "Boolean": ("Boolean", "Boolean", np.bool_),

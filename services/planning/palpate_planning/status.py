@@ -34,15 +34,9 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
-    StrokeStage.REST: Phase.INDENT,
-    StrokeStage.DESCEND: Phase.INDENT,
-    StrokeStage.SETTLE: Phase.INDENT,
-    StrokeStage.SLIDE: Phase.SCAN,
-    StrokeStage.HOLD: Phase.SCAN,
-    StrokeStage.LIFT: Phase.RETRACT,
-    StrokeStage.TRANSFER: Phase.RETRACT,
-    StrokeStage.WAIT: Phase.RETRACT,
-    StrokeStage.DONE: Phase.RETRACT,
+    **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),
+    **dict.fromkeys((StrokeStage.SLIDE, StrokeStage.HOLD), Phase.SCAN),
+    **dict.fromkeys((StrokeStage.LIFT, StrokeStage.TRANSFER, StrokeStage.WAIT, StrokeStage.DONE), Phase.RETRACT),
 }
 """The phase to which each stage of a stroke belongs."""
 PALPATING: Final = frozenset(PHASE_OF.values())
