@@ -15,7 +15,7 @@ PHANTOM = Phantom(
     lesions=(Lesion(centre_m=(-0.05, -0.05)),),
     guarding=(Guarding(centre_m=(-0.03, -0.02), kind="voluntary"),),
     breathing=Breathing(kind="quiet", peak_to_peak_m=0.004),
-    edge_m=0.008,
+    edge_m=0.012,
 )
 """It has all that the wall can do: it stiffens, is guarded and breathes."""
 

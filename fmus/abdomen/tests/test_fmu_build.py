@@ -149,7 +149,7 @@ def test_build_info_and_simulate(tmp_path: Path) -> None:
 def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     mesh = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(subdivisions=3, radius=0.06).apply_translation((0, 0, -0.06)).export(mesh)
+    trimesh.creation.icosphere(subdivisions=3, radius=0.03).apply_translation((0, 0, -0.03)).export(mesh)
     path = tmp_path / "ball.fmu"
     built = runner.invoke(app_for("fmu"), ["fmu", "build", str(mesh), "-o", str(path), "--platform", native(), "--fmi", "2"])
     assert built.exit_code == 0, built.output
