@@ -7,12 +7,16 @@ images of the wall. With z(x) the height of that skin, and z' the height from wh
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
+
+DEEPER_MAX_M: Final = 0.01
+"""Maximum median change of depth: planning follows the skin to millimetres once it has touched it."""
 
 
 class KnownSkin:
@@ -34,11 +38,20 @@ class KnownSkin:
         return np.where(there, deeper, np.nan), np.where(there, sigma, np.nan)
 
     def again(self, samples: Sequence[ForceSample]) -> list[ForceSample]:
-        """The samples with their depths from this skin, where it is known."""
+        """Return the samples with their depths from this skin, where it is known.
+
+        Raises ValueError for a skin that is not where the strokes found it.
+        """
         if not samples:
             return []
         columns = ([sample.time for sample in samples], [s.position for s in samples], [s.normal for s in samples])
         deeper, sigma = self.deeper(*map(np.array, columns))
+        known = deeper[np.isfinite(deeper)]
+        if len(known) and abs(middle := float(np.median(known))) > DEEPER_MAX_M:
+            raise ValueError(
+                f"exam/correction: the skin is {1e3 * middle:.0f} mm from where the strokes counted their depth, "
+                f"allowed: {1e3 * DEEPER_MAX_M:.0f} mm"
+            )
         return [
             sample if np.isnan(by) else sample._replace(depth=sample.depth + float(by), depth_uncertainty=float(s))
             for sample, by, s in zip(samples, deeper, sigma, strict=True)

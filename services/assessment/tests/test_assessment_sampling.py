@@ -179,8 +179,8 @@ def wall() -> Message:
     return SurfaceMesh(header(10 * NS, "world"), p_W.astype(np.float32).ravel(), normals.ravel(), np.empty(0), np.empty(0))
 
 
-def correction(count: int) -> Message:
-    outward, sigma = np.full(count, 0.002, np.float32), np.full(count, 1e-4, np.float32)
+def correction(count: int, height: float = 0.002) -> Message:
+    outward, sigma = np.full(count, height, np.float32), np.full(count, 1e-4, np.float32)
     return SurfaceCorrection(header(20 * NS, "abdomen"), outward, sigma)
 
 
@@ -207,3 +207,10 @@ def test_samples_before_the_scan_or_off_the_surface_are_unchanged() -> None:
 
 def test_a_correction_of_another_surface_is_none() -> None:
     assert skin_of(wall(), correction(8), X_AW) is None
+
+
+def test_a_correction_that_the_strokes_contradict_is_refused() -> None:
+    skin = skin_of(wall(), correction(9, 0.03), X_AW)
+    assert skin is not None
+    with pytest.raises(ValueError, match=r"exam/correction: the skin is 2. mm .* allowed: 10 mm"):
+        skin.again([felt(12.0, 0.0015)])

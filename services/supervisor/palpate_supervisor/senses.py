@@ -13,8 +13,9 @@ air by gradient descent. Weighted least squares gives the force that the joints 
 
     F = (J W J^T + 1 / F_max^2)^-1 J W (r - o - c v / (|v| + v_0)),    W = diag(1 / sd^2)
 
-In a direction that no joint feels (a singular posture) the prior F_max decides: zero instead of amplified noise. The gain G is
-the regression of the reading on the known weight and inertia while the tool moves freely.
+In a direction that no joint feels (a singular posture) the prior F_max decides: zero instead of amplified noise. After a reversal
+sd also contains what is not yet known of the friction, which shrinks with the error of the gradient descent. The gain G is the
+regression of the reading on the known weight and inertia while the tool moves freely.
 """
 
 from math import exp
@@ -44,6 +45,8 @@ class SensesTuning(NamedTuple):
     """Time over which they are learned before the arm first moves."""
     friction_gain: float = 0.03
     """Part of the joints' deviation that a sample adds to their friction."""
+    friction_sd_nm: float = 0.3
+    """SD of a joint's friction before the joint has moved in both directions, that of poor equipment."""
     slow_radps: float = 0.003
     """v_0: joint speed at which friction is half of its value."""
     torque_sd_nm: float = 0.3
@@ -104,7 +107,8 @@ class ForceComparison(NamedTuple):
     excitation: float
     """Information in the gain: sum of the squared changes of the load [N^2]."""
     noise: float
-    """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise."""
+    """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise, at speeds at which the
+    tool can touch: gear ripple makes a fast arm shake."""
     rest_noise: float
     """Noise at the latest rest in free air, where the arm's vibrations do not add to it."""
     joint_sd: float = 0.0
@@ -116,8 +120,9 @@ class ForceSenses:
 
     def __init__(self, joints: int, tuning: SensesTuning = BY_SENSORS) -> None:
         self._tuning = tuning
-        self._joints = np.zeros((5, joints))
-        """Rows: offset, friction, the late sign of the speed, its mean, and the mean load in free air."""
+        self._joints = np.zeros((6, joints))
+        """Rows: offset, friction, the late sign of the speed, its mean, the mean load in free air, and the SD of the friction."""
+        self._joints[5] = tuning.friction_sd_nm
         self._tool = np.zeros((11, 3))
         """Rows of `_compare`."""
         self._sums = np.zeros(5)
@@ -177,7 +182,7 @@ def _compare(
     same at rest [N^2]; smooth speed of the fastest joint [rad/s].
     """
     (joints, tool, sums), (qd, residual, J_W, load), (reading_S, load_S, R_WS) = state, motion, ft
-    offset, friction, sign, mean_sign, usual = joints[0], joints[1], joints[2], joints[3], joints[4]
+    offset, friction, sign, mean_sign, usual, friction_sd = joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]
     bias_S, first_S, late_S, difference_W, joints_W = tool[0], tool[1], tool[2], tool[3], tool[4]
     lag, smooth = _share(dt_s, tuning.lag_s), _share(dt_s, tuning.smooth_s)
     late_S += lag * (reading_S - load_S - late_S)
@@ -185,13 +190,14 @@ def _compare(
     ft_S = late_S - bias_S
 
     deviation = residual - offset - friction * sign
-    sd = np.maximum(tuning.torque_sd_nm, tuning.torque_sd_share * np.maximum(np.abs(load), np.abs(load - usual)))
+    loaded = np.maximum(np.abs(load), np.abs(load - usual))
+    sd = np.hypot(np.maximum(tuning.torque_sd_nm, tuning.torque_sd_share * loaded), friction_sd * (sign - mean_sign))
     J, torque = J_W / sd, deviation / sd
     information = J @ J.T + np.eye(3) / tuning.force_max_n**2
     force_W = np.linalg.solve(information, J @ torque)
     remainder = np.abs(torque - force_W @ J).max()
 
-    (starting, clear), still = free, speed < tuning.still_mps
+    (starting, clear), still, change_S = free, speed < tuning.still_mps, reading_S - tool[9]
     at_rest = (clear and still) or (_norm(ft_S) < tuning.free_ft_n and _norm(force_W) < tuning.free_joints_n)
     if starting or at_rest or speed > tuning.fast_mps:
         slow = _share(dt_s, tuning.start_s if starting else tuning.tare_s)
@@ -202,6 +208,7 @@ def _compare(
         usual += slow * (load - usual)
         mean_sign += settled * (sign - mean_sign)
         friction += tuning.friction_gain * (sign - mean_sign) * deviation
+        friction_sd *= 1 - tuning.friction_gain * (sign - mean_sign) ** 2
         tool[5] += _share(dt_s, tuning.load_s) * (reading_S - tool[5])
         tool[6] += _share(dt_s, tuning.load_s) * (load_S - tool[6])
         tool[7] += slow * (tool[5] - tool[7])
@@ -209,9 +216,9 @@ def _compare(
         change = tool[6] - tool[8]
         sums[0] += (change * (tool[5] - tool[7])).sum()
         sums[1] += (change * change).sum()
-    change_S = reading_S - tool[9]  # of white noise, the next change is half the other way; a step of the force has none
-    white = -2 * (change_S * tool[10]).sum()
-    sums[2] += _share(dt_s, tuning.noise_s) * (white - sums[2])
+    white = -2 * (change_S * tool[10]).sum()  # the next change of white noise is half the other way; a step of the force has none
+    if speed < tuning.fast_mps:
+        sums[2] += _share(dt_s, tuning.noise_s) * (white - sums[2])
     if at_rest and still:
         sums[3] += _share(dt_s, tuning.noise_s) * (white - sums[3])
     tool[9], tool[10] = reading_S, change_S

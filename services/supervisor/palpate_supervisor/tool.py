@@ -42,6 +42,8 @@ class Tool(NamedTuple):
     """Magnitude of the external force [N]: the larger of both senses. By the F/T sensor: minus tool weight and first bias."""
     joint_force: float = 0.0
     """Magnitude of the external force by the joints alone [N]."""
+    contact_force: float = 0.0
+    """As `force`, but by the F/T sensor also minus the inertia of the tool: a tool that a fast arm shakes touches nothing."""
 
 
 class ToolSense:
@@ -75,27 +77,28 @@ class ToolSense:
         observed = self._observer
         if len(torque):
             observed.update(q, qd, torque, dt_s)
-            residual = observed.residual
-        else:  # an arm without joint torques has one sense: the F/T sensor takes the place of the other, and both agree
+        else:
             observed.place(q)
-            measured = measured._replace(torque=np.zeros(model.nv))
-            residual = observed.J_W.T @ self._R_SW.T @ force_S
         velocity_W = observed.J_W @ qd
         before_W = velocity_W if self._velocity_W is None else self._velocity_W
         self._velocity_W = velocity_W
+        acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
+        inertia_S = -self._mass * (self._R_SW @ acceleration_W)
+        residual = observed.residual
+        if not len(torque):  # such an arm has one sense: the F/T sensor takes the place of the other, and both agree
+            measured = measured._replace(torque=np.zeros(model.nv))
+            residual = observed.J_W.T @ self._R_SW.T @ (force_S - inertia_S)
         speed = _norm(velocity_W)
         over = self._rested_s > TUNING.longest_s
         self._moved = self._moved or over or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
         if not self._moved:
             self._rested, self._rested_s = self._rested + 1, self._rested_s + dt_s
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
-        acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
-        load_S = self._R_SW @ (self._weight_W - self._mass * acceleration_W)
-        self.comparison = self._senses.compare(
-            measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, (not self._moved, clear)
-        )
-        ft = _norm(force_S - self._bias_S)
-        return Tool(self._p_WI.copy(), speed, max(ft, self.comparison.joint_force), self.comparison.joint_force)
+        load_S, free = self._R_SW @ self._weight_W + inertia_S, (not self._moved, clear)
+        self.comparison = self._senses.compare(measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, free)
+        ft_S, joints = force_S - self._bias_S, self.comparison.joint_force
+        force, contact_force = (max(_norm(felt_S), joints) for felt_S in (ft_S, ft_S - inertia_S))
+        return Tool(self._p_WI.copy(), speed, force, joints, contact_force)
 
 
 def _norm(x: Array) -> float:

@@ -106,7 +106,7 @@ class LimitWatch:
         workspace and force are the limits.
         """
         p_W, speed, force = tool.p_W, tool.speed, tool.force
-        found = self._speed(speed, force) + self._force(force, stamp, t) + self._workspace(p_W)
+        found = self._speed(speed, tool.contact_force) + self._force(force, stamp, t) + self._workspace(p_W)
         return found if depth is None else found + self._depth(depth)
 
     def _force(self, force: float, stamp: int, t: int) -> list[Breach]:

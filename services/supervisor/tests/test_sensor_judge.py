@@ -134,6 +134,29 @@ def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_l
     assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
 
 
+def test_joints_that_reverse_are_trusted_less_until_their_friction_is_learned() -> None:
+    sense, sds = ToolSense(ROBOT), []
+    true = measurements()[0]
+    for speed in (*np.repeat((0.02, -0.02), 60), *np.tile(np.repeat((0.02, -0.02), 60), 10)):
+        sense.sense(true._replace(qd=np.full_like(true.qd, speed)), DT, clear=True)
+        sds.append(sense.comparison.joint_sd)
+    assert max(sds[60:120]) > 1.1 * min(sds)
+    assert max(sds[-120:]) < 1.03 * min(sds)
+
+
+def test_a_tool_that_a_fast_arm_shakes_touches_nothing() -> None:
+    sense, true = ToolSense(ROBOT), measurements()[0]._replace(torque=np.zeros(0))
+    for _ in range(20):
+        sense.sense(true, DT)
+    sense.sense(true._replace(qd=np.full_like(true.qd, 0.01)), DT)
+    J_W, R_SW, before_S = sense._observer.J_W, sense._R_SW, true.wrench_S[:3]
+    inertia_S = -ROBOT.tool_mass_kg * (R_SW @ (J_W @ np.full(7, 0.2))) / DT
+    shaken = true._replace(qd=np.full_like(true.qd, 0.21), wrench_S=np.concatenate((before_S + inertia_S, np.zeros(3))))
+    tool = sense.sense(shaken, DT)
+    assert tool.force > 5.0
+    assert tool.contact_force < 1.0
+
+
 def test_joints_that_turn_fast_are_trusted_less() -> None:
     sd = []
     for speed in (0.0, 0.3):

@@ -44,7 +44,7 @@ def forces(values: Iterable[float]) -> list[list[Breach]]:
 def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
     watch = watching()
     for n in range(20):  # long enough for what needs patience, and without a rate
-        found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS, n * 10 * MS)
+        found = watch.judge(Tool(p_W, speed, force, contact_force=force), depth, n * 10 * MS, n * 10 * MS)
     return found
 
 
