@@ -11,9 +11,10 @@ from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_assessment.seen_breath import SeenBreath
-from palpate_assessment.skin import KnownSkin
+from palpate_assessment.skin import DEEPER_MAX_M, KnownSkin
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.contract import contract
+from palpate_bus.contract.port_check import MessageViolation, RefusedMessage, ViolationKind
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import point_message, vector_message
@@ -79,6 +80,7 @@ class AssessmentService(Service):
         self._surface: Array | None = None
         self._perceived: Message | None = None
         self._skin: KnownSkin | None = None
+        self._correction: Message | None = None
         """Final surface."""
         self._coarse: MapGrid | None = None
         self._last_map = 0
@@ -127,7 +129,7 @@ class AssessmentService(Service):
     def correct(self, message: Message) -> None:
         """Take the `exam/correction`."""
         if self._perceived is not None:
-            self._skin = skin_of(self._perceived, message, self._X_AW)
+            self._skin, self._correction = skin_of(self._perceived, message, self._X_AW), message
 
     def take(self, state: Message) -> list[ForceSample]:
         """Take the next `exam/state`; return the samples that are complete now. The last ones are at the end of the scan."""
@@ -204,7 +206,11 @@ class AssessmentService(Service):
         return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
 
     def _finish(self, t: int) -> Outbox:
-        if self._skin is not None:
+        if self._skin is not None and self._correction is not None:
+            if abs(change := self._skin.middle_change(self.samples)) > DEEPER_MAX_M:
+                expected = f"within {1e3 * DEEPER_MAX_M:.0f} mm of where the strokes counted their depth"
+                wrong = MessageViolation(ViolationKind.RANGE, "outward", expected, f"{1e3 * change:.0f} mm from there")
+                raise RefusedMessage(contract().topics["exam/correction"], wrong, self._correction)
             self.samples = self._skin.again(self.samples)
         if self._surface is not None:
             self._final = assess(

@@ -37,22 +37,22 @@ class KnownSkin:
         deeper = normal[:, 2] * (height - position[:, 2])
         return np.where(there, deeper, np.nan), np.where(there, sigma, np.nan)
 
-    def again(self, samples: Sequence[ForceSample]) -> list[ForceSample]:
-        """Return the samples with their depths from this skin, where it is known.
+    def middle_change(self, samples: Sequence[ForceSample]) -> float:
+        """Return the median change of depth [m], 0 where the skin is known at no sample."""
+        deeper = self._deeper(samples)[0] if samples else np.zeros(1)
+        known = deeper[np.isfinite(deeper)]
+        return float(np.median(known)) if len(known) else 0.0
 
-        Raises ValueError for a skin that is not where the strokes found it.
-        """
+    def again(self, samples: Sequence[ForceSample]) -> list[ForceSample]:
+        """Return the samples with their depths from this skin, where it is known."""
         if not samples:
             return []
-        columns = ([sample.time for sample in samples], [s.position for s in samples], [s.normal for s in samples])
-        deeper, sigma = self.deeper(*map(np.array, columns))
-        known = deeper[np.isfinite(deeper)]
-        if len(known) and abs(middle := float(np.median(known))) > DEEPER_MAX_M:
-            raise ValueError(
-                f"exam/correction: the skin is {1e3 * middle:.0f} mm from where the strokes counted their depth, "
-                f"allowed: {1e3 * DEEPER_MAX_M:.0f} mm"
-            )
+        deeper, sigma = self._deeper(samples)
         return [
             sample if np.isnan(by) else sample._replace(depth=sample.depth + float(by), depth_uncertainty=float(s))
             for sample, by, s in zip(samples, deeper, sigma, strict=True)
         ]
+
+    def _deeper(self, samples: Sequence[ForceSample]) -> tuple[Array, Array]:
+        columns = ([sample.time for sample in samples], [s.position for s in samples], [s.normal for s in samples])
+        return self.deeper(*map(np.array, columns))
