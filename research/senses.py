@@ -4,7 +4,8 @@ Run: `python -m research.senses FOLDER...`, each FOLDER that of a `palpate run -
 run again over `robot/status`. A lie changes the recorded reading from a moment on: the examination itself does not react to it.
 
 `python -m research.senses --persons 1000-1019 --out senses.csv` examines persons (a region of `person`, composed) and writes a
-row each: false alarms and the largest comparisons. Persons in the file are skipped. Limits are from seeds below 1000.
+row each: false alarms and the largest comparisons; `--set errors=poor` with poor equipment. Persons in the file are skipped.
+Limits are from seeds below 1000.
 """
 
 import argparse
@@ -101,10 +102,10 @@ def seen_after(robot: Robot, run: list[Sample], lie: Lie, size: float, begin: in
     return None
 
 
-def examined(seed: int) -> tuple[object, ...]:
+def examined(seed: int, settings: tuple[str, ...]) -> tuple[object, ...]:
     """Examine a person and return a row of the file."""
     with tempfile.TemporaryDirectory(prefix="palpate-senses-") as folder:
-        given = [part for setting in (*SETTINGS, f"seed={seed}") for part in ("--set", setting)]
+        given = [part for setting in (*SETTINGS, *settings, f"seed={seed}") for part in ("--set", setting)]
         command = [sys.executable, "-m", "palpate", "run", "person", *given, "--composed", "--record", "normal", "--overwrite"]
         subprocess.run([*command, "--out", folder], capture_output=True, check=False)
         report = json.loads((Path(folder) / "report.json").read_text(encoding="utf-8"))
@@ -116,7 +117,7 @@ def examined(seed: int) -> tuple[object, ...]:
     return seed, f"{len(run) * PERIOD_S:.1f}", report["services"]["planning"]["facts"]["message"], stops, alarms, *largest
 
 
-def collect(seeds: range, out: Path) -> None:
+def collect(seeds: range, settings: tuple[str, ...], out: Path) -> None:
     """Examine the persons who are not in the file, and print the rate of false alarms over all in it."""
     rows = list(csv.DictReader(out.open(encoding="utf-8"))) if out.exists() else []
     with out.open("a", encoding="utf-8", newline="") as file:
@@ -124,7 +125,7 @@ def collect(seeds: range, out: Path) -> None:
         if not rows:
             writer.writerow(COLUMNS)
         for seed in (seed for seed in seeds if str(seed) not in {row["seed"] for row in rows}):
-            writer.writerow(examined(seed))
+            writer.writerow(examined(seed, settings))
             file.flush()
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
     bound([row["false_alarms"] for row in rows], sum(float(row["length_s"]) for row in rows) / 3600)
@@ -142,11 +143,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--persons", metavar="FIRST-LAST")
+    parser.add_argument("--set", metavar="FIELD=VALUE", action="append", default=[], dest="settings")
     parser.add_argument("--out", type=Path, default=Path("senses.csv"))
     given = parser.parse_args()
     if given.persons:
         first, last = map(int, given.persons.split("-"))
-        collect(range(first, last + 1), given.out)
+        collect(range(first, last + 1), tuple(given.settings), given.out)
     hours = 0.0
     alarms: list[str] = []
     for folder in given.folders:
