@@ -105,10 +105,11 @@ class StrokeMotion:
         self.joined = self.joined and segment.free is None
         speed = self.speed_mps if segment.contact else MOTION.transfer_mps
         wanted = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
-        drives = self._robot.level is CommandLevel.POSITION  # an arm with an impedance lags behind and does not overshoot
-        self._acceleration = segment.path.acceleration_limit(wanted, self._arm.acceleration_radps2) if drives else wanted
-        velocity = self._limits.joint_velocity_scale * self._arm.velocity_radps
-        self._speed_limit = segment.path.speed_limit(speed, velocity, self._acceleration)
+        velocity, acceleration = self._limits.joint_velocity_scale * self._arm.velocity_radps, self._arm.acceleration_radps2
+        if self._robot.level is not CommandLevel.POSITION:
+            acceleration = np.full_like(acceleration, np.inf)  # an arm with an impedance lags behind and does not overshoot
+        self._acceleration = segment.path.acceleration_limit(wanted, acceleration)
+        self._speed_limit = segment.path.speed_limit(speed, velocity, acceleration, self._acceleration)
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0

@@ -65,7 +65,7 @@ class PathLimits(NamedTuple):
     acceleration_mps2: float = 0.2
     """Tangential acceleration in contact [m/s^2] (assumed)."""
     joint_acceleration_share: float = 0.7
-    """Share of a joint's acceleration for that along the path; the rest is for the path's curvature in joint space."""
+    """Share of a joint's acceleration for speeding up along the path; the rest is for the path's curvature in joint space."""
 
 
 LIMITS = PathLimits()
@@ -136,19 +136,26 @@ class SurfacePath:
         turn = np.abs(np.gradient(self.q, self.s, axis=0)).max(axis=0)
         return min(acceleration, LIMITS.joint_acceleration_share * float((joints / np.maximum(turn, 1e-6)).min()))
 
-    def speed_limit(self, speed: float, turning: Array, acceleration: float) -> SpeedLimit:
+    def speed_limit(self, speed: float, turning: Array, joints: Array, acceleration: float) -> SpeedLimit:
         """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast.
 
-        `turning`: maximum joint speeds [rad/s], shape (n,); `acceleration`: maximum along the path [m/s^2].
+        Near a singular wrist a path is tightly curved in joint space only: |q''| v^2 is at most the joints' share for that.
+
+        `turning`, `joints`: maximum speeds [rad/s] and accelerations [rad/s^2] of the joints, shape (n,); `acceleration`: maximum
+        along the path [m/s^2].
         """
         if self.length == 0.0:
             return SpeedLimit(self.s, np.array([speed]), LIMITS.acceleration_mps2)
         dp = np.gradient(self.p, self.s, axis=0)
         curvature = np.linalg.norm(np.gradient(dp, self.s, axis=0), axis=1)
         turn = np.linalg.norm(np.gradient(self.n, self.s, axis=0), axis=1)
-        joints = np.abs(np.gradient(self.q, self.s, axis=0)) / turning
-        turning_speed = np.minimum(LIMITS.turn_rate_radps / np.maximum(turn, 1e-6), 1.0 / np.maximum(joints.max(axis=1), 1e-6))
-        curving_speed = np.sqrt(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6))
+        dq = np.gradient(self.q, self.s, axis=0)
+        turning_joints = (np.abs(dq) / turning).max(axis=1)
+        turning_speed = np.minimum(LIMITS.turn_rate_radps / np.maximum(turn, 1e-6), 1.0 / np.maximum(turning_joints, 1e-6))
+        curving_joints = (np.abs(np.gradient(dq, self.s, axis=0)) / joints).max(axis=1) / (1 - LIMITS.joint_acceleration_share)
+        curving_speed = np.sqrt(
+            np.minimum(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6), 1.0 / np.maximum(curving_joints, 1e-6))
+        )
         allowed = np.minimum(np.minimum(curving_speed, turning_speed), speed)
         return SpeedLimit(self.s, allowed, 0.7 * min(acceleration, LIMITS.acceleration_mps2))
 
