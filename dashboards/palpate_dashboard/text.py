@@ -55,7 +55,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
     return "\n".join((
         f"**{scenario}: {phase}.** {exam.message}",
         "",
-        f"| targets | {exam.target_index} of {exam.target_count}, {exam.targets_skipped} skipped |",
+        f"| target | {min(exam.target_index + 1, exam.target_count)} of {exam.target_count}, {exam.targets_skipped} skipped |",
         "|---|---|",
         f"| depth | {depth} |",
         f"| normal force | {exam.normal_force:.1f} N |",

@@ -170,7 +170,7 @@ def flange_note(name: str, found: Arm) -> str:
     """Return what to write if the flange's z does not point out of the arm; empty if it does."""
     if name == DEFAULT_ARM:
         return ""
-    return flange_advice(found, arm_file(name)).replace("the YAML file", arm_path(name).name)
+    return flange_advice(found, arm_file(name), arm_path(name).name)
 
 
 def advice(name: str, robot: Robot | None = None) -> str:
@@ -183,7 +183,7 @@ def advice(name: str, robot: Robot | None = None) -> str:
     for home in ready_postures(found):
         if not touching(name, home, robot):
             return f"write `home_rad: {home.tolist()}` in {arm_path(name).name}, which is clear"
-    return home_advice(found, arm_file(name)).replace("the YAML file", arm_path(name).name)
+    return home_advice(found, arm_file(name), arm_path(name).name)
 
 
 def touching(name: str, q: Array, at: Robot | None = None) -> list[str]:

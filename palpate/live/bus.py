@@ -32,7 +32,7 @@ class Joined(NamedTuple):
 def join_bus(connect: Sequence[str] | None, run: str | None, domain: int | None) -> Iterator[Joined]:
     """Join a bus for a `with` block: by endpoints, or of a run, by default the only one on this machine.
 
-    Ctrl-C ends the command with status 0. Raises UserError if it is not there.
+    Ctrl-C ends the command with status 0. Raises UserError if there is no such bus.
     """
     target = find(connect, run, domain)
     try:

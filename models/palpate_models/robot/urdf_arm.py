@@ -68,7 +68,7 @@ def read_arm(name: str) -> tuple[Arm | None, list[str]]:
     return _Reader(given, _resolve(given.urdf, path.parent)).read(path.stem)
 
 
-def flange_advice(arm: Arm, given: ArmFile) -> str:
+def flange_advice(arm: Arm, given: ArmFile, file: str = "the YAML file") -> str:
     """Return which turn of the flange to write if its z does not point out of the arm; empty if it does, or cannot be seen."""
     p, R = arm.flange_m, Rotation.from_euler("xyz", given.flange_rpy_rad)
     axis = int(np.argmax(np.abs(p)))
@@ -78,14 +78,14 @@ def flange_advice(arm: Arm, given: ArmFile) -> str:
     turn = Rotation.from_rotvec((np.pi, 0, 0) if axis == 2 else np.cross((0, 0, np.pi / 2), out))
     with warnings.catch_warnings(action="ignore"):  # a gimbal lock, where the angles are still right
         rpy = np.round((R * turn).as_euler("xyz"), 4) + 0.0
-    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in the YAML file"
+    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in {file}"
 
 
-def home_advice(arm: Arm, given: ArmFile) -> str:
+def home_advice(arm: Arm, given: ArmFile, file: str = "the YAML file") -> str:
     """Return which field to write with which value, where an arm's home posture is missing or unusable."""
     angles = ", ".join(arm.joint_names)
-    other = f"write `home_rad: [...]` in the YAML file: [rad] of {angles} with the tool straight down, clear of the arm"
-    return flange_advice(arm, given) or other
+    other = f"write `home_rad: [...]` in {file}: [rad] of {angles} with the tool straight down, clear of the arm"
+    return flange_advice(arm, given, file) or other
 
 
 def _resolve(name: str, folder: Path) -> Path:
