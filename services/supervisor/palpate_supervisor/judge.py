@@ -1,6 +1,6 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
-from math import exp
+from math import exp, hypot, sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,8 +27,12 @@ class JudgeTuning(NamedTuple):
     """Above it a disagreement is blamed on the joints, below it on the F/T sensor."""
     offset_nm: float = 6.0
     drift_n: float = 4.0
-    gain: float = 0.3
-    """Maximum relative error of the gain of the F/T sensor."""
+    gain_sds: float = 4.0
+    """Limit of the gain's error in standard deviations."""
+    gain_sd: float = 0.08
+    """Standard deviation of the gain of poor sensors, weighed by a tool whose mass is not known exactly."""
+    wander_n: float = 0.33
+    """What the bias wanders while the load changes: by that over the root of the information, the gain has another error."""
     excitation_n2: float = 5.0
     """Minimum information on the gain for the self-test."""
     noise_n: float = 1.5
@@ -77,8 +81,9 @@ class SensorJudge:
         """Weigh the tool: it is known, and its weight and inertia change in sensor axes on the way to the first target."""
         if c.excitation >= TUNING.excitation_n2:
             self._tested = True
-            if abs(c.gain - 1) > TUNING.gain:
-                return _ft(f"gain {c.gain:.2f} by the weight of the tool, allowed 1 +- {TUNING.gain:g}")
+            limit = TUNING.gain_sds * hypot(TUNING.gain_sd, TUNING.wander_n / sqrt(c.excitation))
+            if abs(c.gain - 1) > limit:
+                return _ft(f"gain {c.gain:.2f} by the weight of the tool, allowed 1 +- {limit:.2f}")
         elif not self._tested and depth is not None and depth > -TUNING.tested_above_m:
             return _ft("self-test incomplete before the first touch: the tool was not moved enough to weigh it")
         return []

@@ -124,6 +124,12 @@ R_WS = np.eye(3, order="F")
 """Laid out as the service's, for which the comparison is compiled already."""
 
 
+@pytest.mark.parametrize(("gain", "excitation", "seen"), [(1.4, 5.0, False), (1.4, 50.0, True), (0.3, 5.0, True)])
+def test_a_gain_weighed_while_the_bias_wanders_is_uncertain(gain: float, excitation: float, seen: bool) -> None:
+    weighed = ForceComparison(0.0, 0.0, 0.0, 0.0, 0.0, gain, excitation, 0.1, 0.1)
+    assert [breach.culprit for breach in SensorJudge().judge(weighed, None)] == [FT] * seen
+
+
 def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_learned() -> None:
     senses, J = ForceSenses(6, BY_CURRENT), 0.6 * np.eye(3, 6)
     sd = []
