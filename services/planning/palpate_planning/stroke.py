@@ -195,14 +195,14 @@ def _hold(motion: StrokeMotion) -> Stages[None]:
 
 
 def lift(motion: StrokeMotion, height: Callable[[int], float]) -> Stages[None]:
-    """Rise along the normal to `height(t)` [m], and wait there until the arm may move on."""
+    """Rise along the normal to `height(t)` [m], and wait there at rest until the arm may move on."""
     highest = 0.0
     while True:
         now = yield StrokeStage.LIFT
-        motion.brake()
+        resting = motion.brake()
         highest = max(highest, height(now.t))
         up = motion.depth_axis.step(-highest, STROKE.lift_mps)
-        if up and not now.paused and (now.ending or (now.calm and now.aligned)):
+        if up and resting and not now.paused and (now.ending or (now.calm and now.aligned)):
             return
 
 

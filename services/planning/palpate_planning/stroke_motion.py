@@ -205,11 +205,13 @@ class StrokeMotion:
         """Follow the path above the wall to path length `goal` [m]; return True once there."""
         return self.along.step(goal, max(self._speed_limit.at(self.along.position), MOTION.creep_mps))
 
-    def brake(self) -> None:
-        """Come to rest along the path; pause a free motion."""
+    def brake(self) -> bool:
+        """Come to rest along the path; pause a free motion. Return True at rest."""
         self._following = False
-        if self.along.velocity > 1e-4:
+        resting = self.along.velocity <= 1e-4
+        if not resting:
             self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, MOTION.creep_mps))
+        return resting
 
     def follow_free_motion(self, rate: float) -> bool:
         """Advance the segment's free motion by `rate` samples; return True once the arm is at its end."""

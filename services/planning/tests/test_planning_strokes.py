@@ -17,10 +17,11 @@ from palpate_planning.interruptions import Displacement
 from palpate_planning.motion.kinematics import IkSolution
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.reasons import Cause
+from palpate_planning.stroke import StrokeInput, lift
 from palpate_planning.stroke_motion import StrokeMotion, stroke_setpoint
 from palpate_planning.strokes.coverage import TUNING, Stroke, strokes, touches
 from palpate_planning.strokes.path import SurfacePath, centre, frame, frames_along, least_twist
-from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner
+from palpate_planning.strokes.segments import REACH, SEGMENTS, STRETCHED, Segment, SegmentPlanner
 from palpate_planning.wall.surface import PerceivedSurface
 from palpate_planning.wall.wall import plane
 
@@ -182,6 +183,21 @@ def test_drives_can_follow_a_joint_that_turns_fast(level: CommandLevel, kept: bo
         joint.append(motion.point.q[3])
     acceleration = np.abs(np.diff(joint, 2)).max() / 0.01**2
     assert bool(acceleration < 1.1 * lbr.ARM.acceleration_radps2[3]) is kept
+
+
+def test_a_transfer_that_is_left_comes_to_rest_before_the_lift_ends() -> None:
+    """It is at the lift's height already; what follows begins with the arm at rest."""
+    path, settings = dome_path(21), known()
+    motion = StrokeMotion(settings.exam, settings.limits, settings.robot, 0.01, plane(np.eye(4)))
+    motion.start(Segment(path, contact=False))
+    while motion.along.velocity < 0.01:
+        motion.travel(path.length)
+    lifting = lift(motion, lambda t: SEGMENTS.hover_m)
+    next(lifting)
+    with pytest.raises(StopIteration):
+        for k in range(100):
+            lifting.send(StrokeInput(k, Mock(), ending=True))
+    assert motion.along.velocity < 1e-3
 
 
 def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:
