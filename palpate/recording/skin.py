@@ -1,15 +1,16 @@
 """The unpressed skin: a smooth height field through the places where contacts begin, as a Gaussian process."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
+from warnings import catch_warnings
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
 from scipy.linalg import cho_solve
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from threadpoolctl import threadpool_limits
 
-from palpate.recording.process import PlaceProcess
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.patient.mesh import vertex_normals
@@ -97,22 +98,25 @@ def fit_skin(points: Array, sd: Array, stations: tuple[Array, Array], shortest: 
     rest = points[:, 2] - centre[2] - _terms(points, centre, terms) @ plane
     size = max(float(np.sqrt(np.mean(rest**2))), float(np.median(sd)), 1e-6)
     extent = float(np.ptp(points[:, :2], axis=0).max()) + shortest
-    begin = np.log((1.0, max(shortest, 0.5 * extent), 0.05))
-    process = PlaceProcess(points[:, :2], rest / size, (sd / size) ** 2, begin)
-    with threadpool_limits(1):
-        process = process.fit(((0.05, 1e3), (shortest, 10 * extent), (1e-4, 1.0)))
+    noise = (sd / size) ** 2
+    smooth = ConstantKernel(1.0, (0.05, 1e3)) * RBF(max(shortest, 0.5 * extent), (shortest, 10 * extent))
+    process = GaussianProcessRegressor(smooth + WhiteKernel(0.05, (1e-4, 1.0)), alpha=noise)
+    with threadpool_limits(1), catch_warnings(action="ignore"):  # the best length may be at its bound
+        process.fit(points[:, :2], rest / size)
         for _ in range(_OUTLIERS):
-            precision = np.diag(cho_solve((process.cholesky, True), np.eye(len(points))))
-            off = process.weights / precision  # of each point from the skin through the others
+            precision = np.diag(cho_solve((process.L_, True), np.eye(len(points))))
+            off = process.alpha_ / precision  # of each point from the skin through the others
             strange = np.abs(off) * np.sqrt(precision) > _STRANGE
             if not strange.any():
                 break
-            noise = np.where(strange, np.maximum(process.known_noise, off**2), process.known_noise)
-            process = replace(process, known_noise=noise)
+            noise = np.where(strange, np.maximum(noise, off**2), noise)
+            process = GaussianProcessRegressor(process.kernel_, alpha=noise, optimizer=None).fit(points[:, :2], rest / size)
     x, y = stations
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    z = centre[2] + _terms(xy, centre, terms) @ plane + size * process.mean(xy)
-    return RecordedSkin(x, y, z.reshape(len(x), len(y)), (size * process.sd(xy)).reshape(len(x), len(y)))
+    mean, spread = process.predict(xy, return_std=True)
+    z = centre[2] + _terms(xy, centre, terms) @ plane + size * mean
+    known = np.sqrt(np.maximum(spread**2 - process.kernel_.k2.noise_level, 0.0))  # of the skin, not of a point of it
+    return RecordedSkin(x, y, z.reshape(len(x), len(y)), (size * known).reshape(len(x), len(y)))
 
 
 def _terms(places: Array, centre: Array, count: int) -> Array:

@@ -14,12 +14,14 @@ from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 from typing import Final, NamedTuple
+from warnings import catch_warnings
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-from palpate.recording.process import PlaceProcess, matern
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_assessment.sampling import ForceSample
@@ -202,26 +204,23 @@ class _Field:
         """`places` [m], shape (n, 2); `level` [N/m^3]: value before the first correction."""
         self._scale = _spacing(places)
         self._places, self._level = places, np.log(level)
-        self._process: PlaceProcess | None = None
+        smooth = ConstantKernel(0.05, (1e-5, 1e5)) * Matern(3.0, (1.0, 100.0), nu=1.5)
+        self._process = GaussianProcessRegressor(smooth + WhiteKernel(0.01, (1e-5, 1.0)))
 
     def correct(self, ratio: Array) -> None:
         """Take the ratios of a simulation with the present field [1], shape (n,)."""
         values = self._log(self._places) + np.log(np.maximum(ratio, 1e-3))
         self._level = float(np.median(values))
-        rest = values - self._level
-        if self._process is None:  # its lengths are those of the first observations
-            begin = PlaceProcess(self._places / self._scale, rest, np.zeros(len(rest)), np.log((0.05, 3.0, 0.01)), matern)
-            self._process = begin.fit(((1e-5, 1e5), (1.0, 100.0), (1e-5, 1.0)))
-        else:
-            self._process = replace(self._process, values=rest)
+        with catch_warnings(action="ignore"):  # the best variance may be at its bound
+            self._process.fit(self._places / self._scale, values - self._level)
+        self._process.set_params(kernel=self._process.kernel_, optimizer=None)  # its lengths are those of the first observations
 
     def __call__(self, xy: Array) -> Array:
         """Return the modulus at points [m], shape (p, 2) -> (p,)."""
         return np.exp(self._log(xy))
 
     def _log(self, xy: Array) -> Array:
-        rest = 0.0 if self._process is None else self._process.mean(xy / self._scale)
-        return np.asarray(np.full(len(xy), self._level) + rest)
+        return np.asarray(self._level + self._process.predict(xy / self._scale))
 
 
 def _spacing(places: Array) -> float:
