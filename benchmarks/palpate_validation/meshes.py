@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.linalg import solveh_banded
+from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from palpate_models.numerics.frames import Array, Mask
+from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
@@ -71,36 +71,22 @@ def static_force(depth: float, radius: float, k_w: Profile, shear: Profile, h: f
     spring = shear(middle) * 2 * np.pi * middle / h
     area = 2 * np.pi * r * h
     area[0], area[-1] = np.pi * (h / 2) ** 2, np.pi * r[-1] * h
-    diagonal = k_w(r) * area
-    diagonal[:-1] += spring
-    diagonal[1:] += spring
+    slope = sparse.eye_array(len(middle), len(r), k=1) - sparse.eye_array(len(middle), len(r))
+    stiffness = (slope.T @ sparse.diags_array(spring) @ slope + sparse.diags_array(k_w(r) * area)).tocsc()
     hold = np.where(r < radius, depth - radius + np.sqrt(np.maximum(radius**2 - r**2, 0)), -1.0)
     active = hold > 0
     for _ in range(MOST_ITERATIONS):
-        u = _solve(diagonal, spring, active, hold)
-        f = diagonal * u
-        f[:-1] -= spring * u[1:]
-        f[1:] -= spring * u[:-1]
+        free = ~active
+        free[-1] = False  # u = 0 at the outer end
+        u = np.where(active, hold, 0.0)
+        u[free] = spsolve(stiffness[free][:, free], -(stiffness @ u)[free])
+        f = stiffness @ u
         new = np.where(active, f > 0, hold > u)
         new[-1] = False
         if (new == active).all():
             return float(f[active].sum())
         active = new
     raise RuntimeError(f"foundation: no contact set after {MOST_ITERATIONS} iterations at depth {depth} m")
-
-
-def _solve(diagonal: Array, spring: Array, active: Mask, hold: Array) -> Array:
-    """Return the equilibrium with `u = hold` where `active` and u = 0 at the outer end."""
-    prescribed = active.copy()
-    prescribed[-1] = True
-    value = np.where(active, hold, 0.0)
-    right = np.where(prescribed, value, 0.0)
-    right[:-1] += np.where(~prescribed[:-1] & prescribed[1:], spring * value[1:], 0.0)
-    right[1:] += np.where(~prescribed[1:] & prescribed[:-1], spring * value[:-1], 0.0)
-    band = np.zeros((2, len(diagonal)))
-    band[1] = np.where(prescribed, 1.0, diagonal)
-    band[0, 1:] = np.where(prescribed[:-1] | prescribed[1:], 0.0, -spring)
-    return np.asarray(solveh_banded(band, right))
 
 
 DEPTHS_M = np.array((2, 3, 5, 7.5, 10, 15)) * 1e-3
