@@ -16,8 +16,7 @@ from palpate.report.archive import Evidence, read_completed, write_evidence
 from palpate.truth.pressed import Touched
 from palpate_bus.messages import NS
 from palpate_conductor.collector import Collected
-from palpate_reproduction import figures
-from palpate_reproduction.page import choose_moments
+from palpate_reproduction.page import choose_moments, draw_graph
 from palpate_reproduction.scene import Body, Viewpoint, draw
 
 
@@ -45,7 +44,7 @@ def test_the_graph_counts_what_was_there(tmp_path: Path) -> None:
         {"topic": "control/joint_torque", "publishers": ["control"], "subscribers": ["robot"]},
     ]
     path = tmp_path / "graph.png"
-    assert figures.graph(path, rows, ("recorder",)) == (4, 2)
+    assert draw_graph(path, rows, ("recorder",)) == (4, 2)
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
     service, watcher = (np.abs(image - c).max(axis=-1) < 6 for c in ((0xCC, 0xFB, 0xF1), (0xE2, 0xE8, 0xF0)))
     assert service.sum() > 2.5 * watcher.sum() > 0
