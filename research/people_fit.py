@@ -74,7 +74,7 @@ def fits() -> dict[tuple[str, str], Fit]:
     found = {}
     for region, person in track(remus2024.relaxed_people(), "places"):
         wall, offset, rms = fit(curves[region, person].force(COMPARED_M), simulated)
-        tensed = curves[remus2024.activated_region(region), person]
+        tensed = curves[region.replace("R", "A"), person]  # of the same place
         ratio = float(tensed.force(PRESS.ratio_at_m) / curves[region, person].force(PRESS.ratio_at_m))
         found[region, person] = Fit(wall, offset, rms, ratio, tension(ratio))
     print("median person:", fit(remus2024.median_force(COMPARED_M), simulated))

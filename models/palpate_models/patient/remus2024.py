@@ -69,11 +69,6 @@ def median_force(depth_m: Array) -> Array:
     return np.median([curves()[place].force(depth_m) for place in relaxed_people()], axis=0)
 
 
-def activated_region(region: str) -> str:
-    """Return the region of the same place with tensed muscles: "A3" for "R3"."""
-    return region.replace("R", "A")
-
-
 def exponent(force: Array) -> float:
     """Mean exponent of the force in the depth between a depth and its double, of the two forces there, shape (2,)."""
     return float(np.log2(force[1] / force[0]))
