@@ -7,6 +7,15 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+
+@cache
+def palpation_definitions() -> dict[str, str]:
+    """Return the .msg text of every message of the ROS 2 package `palpation_msgs`, in a wheel or a checkout, by type name."""
+    package = Path(__file__).resolve().parents[1]
+    paths = sorted(path for place in (package, package.parent) for path in place.glob("palpation_msgs/msg/*.msg"))
+    return {f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in paths}
+
+
 PACKAGES: dict[str, tuple[str, ...]] = {
     "builtin_interfaces": ("Duration", "Time"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
@@ -15,12 +24,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
         "WrenchStamped",
     ),
     "nav_msgs": ("Path",),
-    "palpation_msgs": (
-        "Advance", "CameraTrigger", "ExamState", "Finding", "Findings", "ImpedanceSetpoint", "IndentationTruth",
-        "JointTorqueCommand", "OperatorRequest", "PalpationSample", "PalpationTargets", "PatientTruth", "PhantomTruth",
-        "RecordChunk", "RobotStatus", "RunControl", "SearchRequest", "ServiceReport", "SkinTouch", "StiffnessMap",
-        "SupervisorState", "SurfaceCorrection", "SurfaceMesh", "SurfaceMotion", "ToolState",
-    ),
+    "palpation_msgs": tuple(name.rpartition("/")[2] for name in palpation_definitions()),
     "rosgraph_msgs": ("Clock",),
     "sensor_msgs": ("CameraInfo", "Image", "JointState", "PointCloud2", "PointField", "RegionOfInterest"),
     "std_msgs": ("Header", "String"),
@@ -34,13 +38,6 @@ TYPE_NAMES: dict[str, str] = {name: f"{package}/msg/{name}" for package, names i
 
 class CodecError(ValueError):
     """Bytes that do not hold the expected type, a message that does not fit its type, or an unknown type."""
-
-
-def palpation_definitions() -> dict[str, str]:
-    """Return the .msg text of every message of the ROS 2 package `palpation_msgs`, in a wheel or a checkout, by type name."""
-    package = Path(__file__).resolve().parents[1]
-    paths = sorted(path for place in (package, package.parent) for path in place.glob("palpation_msgs/msg/*.msg"))
-    return {f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in paths}
 
 
 def _load_store() -> Any:
