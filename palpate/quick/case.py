@@ -1,9 +1,6 @@
 """One quick case: an examination without an arm as messages, the assessment service, and the scores of whole examinations."""
 
-import gc
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from time import perf_counter, process_time
 from typing import Any, Final, NamedTuple
 
@@ -20,6 +17,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import NS, ExamState, IndentationTruth, Message, PhantomTruth, Point, codec, header, nanoseconds
 from palpate_bus.messages.geometry import mesh_message, pose_message
 from palpate_bus.runtime.lockstep import run_hash
+from palpate_bus.runtime.process import rare_collections
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox
 from palpate_conductor.collector import Collected
@@ -154,21 +152,9 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
 
 def examine_quickly(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> Collected:
     """Return what a conductor would have collected before the assessment. Arguments and errors as of `run_quick`."""
-    with _no_garbage_collection():
+    with rare_collections():  # 100,000 new messages are in no reference cycles
         examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
         return collect_messages(examination, examination.run())
-
-
-@contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Suspend the search for reference cycles: 100,000 new messages hold none, and the search takes longer than making them."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def assess(service: Service, gathered: Collected) -> dict[str, Any]:

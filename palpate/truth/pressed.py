@@ -20,6 +20,7 @@ from palpate_models.numerics.cache import content_key, remember
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
+from palpate_models.patient.mesh import vertex_normals
 from palpate_models.patient.motion import Motion
 from palpate_models.patient.schema import Lesion, Structure
 from palpate_models.scenario.schema import Exam, Scenario
@@ -45,13 +46,9 @@ class TrueSurface:
         facing = normal[:, 2] > 0.1 * np.linalg.norm(normal, axis=1)
         front = np.unique(body.triangles[facing])
         mesh = Delaunay(body.vertices[front, :2])
-        total = np.zeros((len(body.vertices), 3))
-        for k in range(3):
-            np.add.at(total, body.triangles[facing, k], normal[facing])
-        unit = total[front] / np.linalg.norm(total[front], axis=1, keepdims=True)
         self._mesh, self._front = mesh, front
         self._height = LinearNDInterpolator(mesh, body.vertices[front, 2])
-        self._normal = LinearNDInterpolator(mesh, unit)
+        self._normal = LinearNDInterpolator(mesh, vertex_normals(body.vertices, body.triangles[facing])[front])
 
     def between(self, values: Array) -> LinearNDInterpolator:
         """Return an interpolator of values at the vertices, shape (n,): xy, shape (p, 2) -> (p,); NaN off the surface."""

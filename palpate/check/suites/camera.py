@@ -8,12 +8,10 @@ from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
 from palpate_bus.messages import MS, CameraTrigger, header, nanoseconds
 from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame
+from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.numerics.frames import Array
 
-IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
-SMALL_IMAGE, SMALL_INFO = "camera/follow/depth", "camera/follow/camera_info"
 SMALL_WIDTHS = (48, 192)
-FRAME = "camera_depth_optical_frame"
 
 
 class ViewedPlane(NamedTuple):

@@ -6,9 +6,9 @@ import numpy as np
 
 from palpate.check import shapes
 from palpate.check.rig import Feed, Rig
-from palpate.check.suites.camera import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_bus.messages import CameraTrigger, SurfaceMotion, TFMessage, TransformStamped, header
 from palpate_bus.messages.geometry import camera_info, depth_message, mesh_arrays, transform_message, vectors
+from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.numerics.frames import Array, apply, inverse, look_at
 from palpate_models.scenario.load import exam_input
 

@@ -4,6 +4,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE
@@ -178,7 +179,7 @@ class Pipeline:
         x = stations(cx + shift[0], width + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         y = stations(cy + shift[1], height + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         nodes, known = cloud.downsample(p_A, x, y)
-        keep = _grow(known.reshape(len(x), len(y)), 2).ravel()
+        keep = binary_dilation(known.reshape(len(x), len(y)), iterations=2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
         a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
         triangles = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
@@ -202,11 +203,3 @@ def _remarks(guessed: int, nodes: int, motion: float) -> str:
     if motion > PIPELINE.motion_m:
         remarks.append(f"the surface moved during the burst by {1e3 * motion:.1f} mm (standard deviation), probably breathing")
     return "; ".join(remarks)
-
-
-def _grow(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
-    """Return a mask of the grid, dilated by `cells` in each direction."""
-    for _ in range(cells):
-        padded = np.pad(mask, 1)
-        mask = padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-    return mask
