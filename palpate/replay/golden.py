@@ -20,13 +20,12 @@ from mcap.writer import CompressionType, Writer
 from palpate.apart import run_guarded, shared_numbers
 from palpate.console import SteadyConsole, TimeLeft, fail, print_json, wide_console
 from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
-from palpate_bus import implementations
+from palpate_bus import Service, implementations
 from palpate_bus.contract import Contract, Edge, Topic, contract
 from palpate_bus.mcap_records import RecordingError
 from palpate_bus.messages import MS, codec, nanoseconds, time_message
 from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording, open_recording
 from palpate_bus.runtime.lockstep import Packet, Stepper
-from palpate_bus.service import Service
 from palpate_bus.settings import Settings
 from palpate_inputs import read_text
 from palpate_models.scenario.load import load_scenario, view_of

@@ -15,8 +15,7 @@ from palpate_assessment.skin import DEEPER_MAX_M, KnownSkin
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import MessageViolation, RefusedMessage, ViolationKind
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, SurfaceMotion
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import ExamState, Finding, Findings, Message, PalpationSample, Point, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.geometry import point_message, vector_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service

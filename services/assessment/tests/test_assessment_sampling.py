@@ -7,9 +7,7 @@ from palpate_assessment.grid import map_grid
 from palpate_assessment.sampling import TRAVEL, ContactState, ForceSample, Sampler
 from palpate_assessment.seen_breath import SeenBreath, depth_seen
 from palpate_assessment.service import skin_of
-from palpate_bus.messages import SurfaceCorrection, SurfaceMesh
-from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages import NS, Message, SurfaceCorrection, SurfaceMesh, header
 
 UP = np.array((0.0, 0.0, 1.0))
 

@@ -12,9 +12,8 @@ from palpate.report.scoring import Truth, score
 from palpate_assessment.assess import UnassessedReason
 from palpate_assessment.service import MAP, AssessmentService, create
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
+from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3, header, nanoseconds
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.service import Outbox
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.scenario.load import exam_input

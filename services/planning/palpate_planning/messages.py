@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Path, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import ExamState, Message, Path, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion
 from palpate_bus.messages.geometry import mesh_arrays, point_message, pose_message, vector_message, vectors
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array

@@ -7,9 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
+from palpate_bus.messages import MS, NS, OperatorRequest, RobotStatus, SupervisorState, header, nanoseconds
 from palpate_bus.messages.geometry import vector, wrench
-from palpate_bus.messages.stamps import MS, NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
 from palpate_models.robot.arm import arm_of

@@ -7,9 +7,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
+from palpate_bus.messages import MS, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench, header
 from palpate_bus.messages.geometry import mesh_message
-from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr

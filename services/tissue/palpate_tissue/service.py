@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import IndentationTruth, PatientTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
-from palpate_bus.messages.codec import Message
+from palpate_bus.messages import IndentationTruth, Message, PatientTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
 from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
