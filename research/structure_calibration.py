@@ -25,11 +25,12 @@ from palpate.report.results import truth_of_run
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.detection import SURE, Candidate
-from palpate_assessment.findings import Kind, causes, marked_share
+from palpate_assessment.findings import causes, marked_share
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
 from palpate_assessment.shapes import ridge
 from palpate_assessment.standard import USUAL
+from palpate_bus.messages.codes import FindingKind
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Phantom, Structure, StructureKind
@@ -37,7 +38,7 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Marked, Scenario
 from research.assessment_calibration import real, scenario
 
-NOTHING: Final = len(Kind)
+NOTHING: Final = len(FindingKind)
 Change = Callable[[Phantom, np.random.Generator], Phantom]
 
 
@@ -122,13 +123,13 @@ PERSONS: Final[dict[str, Change]] = {
     "fast relaxation": relaxing((0.6, 0.6), (0.1, 30.0)),
     "bones nearer": nearer_bones,
 }
-STRUCTURES: Final[dict[str, tuple[Change, Kind]]] = {
-    "oblique scar": (having(oblique_scar), Kind.RIDGE),
-    "midline scar": (having(midline_scar), Kind.RIDGE),
-    "curved scar": (having(curved_scar), Kind.RIDGE),
-    "short scar": (having(short_scar), Kind.RIDGE),
-    "hernia": (having(hernia), Kind.SOFT_DEFECT),
-    "wide linea alba": (having(wide_linea_alba), Kind.SOFT_DEFECT),
+STRUCTURES: Final[dict[str, tuple[Change, FindingKind]]] = {
+    "oblique scar": (having(oblique_scar), FindingKind.RIDGE),
+    "midline scar": (having(midline_scar), FindingKind.RIDGE),
+    "curved scar": (having(curved_scar), FindingKind.RIDGE),
+    "short scar": (having(short_scar), FindingKind.RIDGE),
+    "hernia": (having(hernia), FindingKind.SOFT_DEFECT),
+    "wide linea alba": (having(wide_linea_alba), FindingKind.SOFT_DEFECT),
 }
 SHARE: Final = 0.5
 """Weight of a candidate of a person with a structure: in the population they are rarer."""
@@ -174,10 +175,9 @@ def evidence(name: str, seed: int) -> list[Evidence]:
     for one in judged[1]:
         if one.beyond > -SURE:
             is_lump = known is not None and real(one, known)
-            true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.structures))
-            rows.append(
-                Evidence(one.features.tolist(), list(one.signs), one.structures().tolist(), marked_share(marks, one.bump), true)
-            )
+            true = [int(FindingKind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.structures))
+            features, structures = one.features.tolist(), one.structures().tolist()
+            rows.append(Evidence(features, list(one.signs), structures, marked_share(marks, one.bump), true))
     return rows
 
 
@@ -186,12 +186,12 @@ def _other_causes(name: str, one: Candidate, structures: tuple[Structure, ...]) 
     if name in STRUCTURES:
         kind, at = STRUCTURES[name][1], np.array((one.disc.x, one.disc.y))
         near = any(along(a, at) < max(a.radii_m) + one.disc.radius for a in structures)
-        if near and (one.log_contrast < 0) == (kind is Kind.SOFT_DEFECT):
+        if near and (one.log_contrast < 0) == (kind is FindingKind.SOFT_DEFECT):
             return {int(kind)}
     at_border = one.inside_m < 0.02
     if name == "bones nearer" and at_border and abs(one.t) > 4 and one.log_contrast > np.log(1.5):
-        return {int(Kind.BONE)}
-    return {int(Kind.MUSCLE), NOTHING} | ({int(Kind.BONE)} if at_border else set())
+        return {int(FindingKind.BONE)}
+    return {int(FindingKind.MUSCLE), NOTHING} | ({int(FindingKind.BONE)} if at_border else set())
 
 
 def along(structure: Structure, at: Array) -> float:
@@ -264,7 +264,7 @@ def main(
             features, signs, evidence = (np.array([getattr(r, f) for r in person]) for f in ("features", "signs", "structures"))
             evidence[:, 2] = [marked * r.marked for r in person]
             logits, kinds = causes(calibration, features, signs, evidence)
-            over, lump = logits > calibration.threshold(0.02), np.array([int(Kind.LUMP) in row.true for row in person])
+            over, lump = logits > calibration.threshold(0.02), np.array([int(FindingKind.LUMP) in row.true for row in person])
             found, lumps, false = found + bool((over & lump).any()), lumps + bool(lump.any()), false + bool((over & ~lump).any())
             if name in STRUCTURES and (true := np.array([int(STRUCTURES[name][1]) in row.true for row in person])).any():
                 best = kinds[true][kinds[true].sum(axis=1).argmax()]

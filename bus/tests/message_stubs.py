@@ -1,4 +1,4 @@
-"""Writes `__init__.pyi` of the messages, which declares the fields of their classes for type checkers.
+"""Writes the stubs of the messages, which declare the fields of their classes and the members of their enumerations.
 
 python bus/tests/message_stubs.py     after a change of a .msg file or of typestore.py; a test says if it is out of date
 """
@@ -9,9 +9,10 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from palpate_bus import messages
+from palpate_bus.messages import codes
 from palpate_bus.messages.typestore import TYPE_NAMES, array_dtype, store
 
-STUB = Path(str(messages.__file__)).with_suffix(".pyi")
+STUB, CODES_STUB = (Path(str(module.__file__)).with_suffix(".pyi") for module in (messages, codes))
 
 _HEAD = '''\
 """Written by `python bus/tests/message_stubs.py`; change the .msg files or typestore.py instead."""
@@ -42,6 +43,15 @@ def stub() -> str:
     return "\n\n".join([_HEAD.rstrip(), *(_class_lines(short, name) for short, name in TYPE_NAMES.items())]) + "\n"
 
 
+def codes_stub() -> str:
+    """Return the text of `codes.pyi`: a class per enumeration."""
+    classes = []
+    for name in codes.ENUMERATIONS:
+        members = [f"    {member.name} = {member.value}" for member in getattr(codes, name)]
+        classes.append("\n".join((f"class {name}(IntEnum):", *members)))
+    return "\n\n".join((_HEAD.partition("\n")[0], "from enum import IntEnum", *classes)) + "\n"
+
+
 def _class_lines(short: str, name: str) -> str:
     definition = store.get_msgdef(name)
     fields = [f"    {field}: {_type_of(description)}" for field, description in definition.fields]
@@ -69,3 +79,4 @@ def _type_of(description: Any) -> str:
 
 if __name__ == "__main__":
     STUB.write_text(stub(), encoding="utf-8")
+    CODES_STUB.write_text(codes_stub(), encoding="utf-8")

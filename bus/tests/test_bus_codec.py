@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from message_strategies import messages
-from message_stubs import STUB, stub
+from message_stubs import CODES_STUB, STUB, codes_stub, stub
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec, duration_message, header
@@ -128,3 +128,4 @@ def test_unknown_type_is_named() -> None:
 
 def test_type_stubs_are_those_of_the_definitions() -> None:
     assert STUB.read_text(encoding="utf-8") == stub(), "run python bus/tests/message_stubs.py"
+    assert CODES_STUB.read_text(encoding="utf-8") == codes_stub(), "run python bus/tests/message_stubs.py"

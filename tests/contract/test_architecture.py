@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 """Roles that step in simulated time."""
 MAY_KNOW_THE_PHANTOM = {"tissue"}
-SHARED_VALUES = {"palpate_bus.setpoint"}
-"""Arrays that planning makes and control follows, with their conversion to a message."""
+SHARED_VALUES = {"palpate_bus.messages.codes", "palpate_bus.setpoint"}
+"""Codes that messages carry, and the arrays that planning makes and control follows, with their conversion to a message."""
 MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py"}
 NOT_IN_A_STEP = {
     "zenoh",

@@ -1,7 +1,6 @@
 """Samples to map and findings: the whole of the assessment, arrays in, arrays out."""
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -16,20 +15,12 @@ from palpate_assessment.model import Regression, cholesky_inverse, prior_log_amp
 from palpate_assessment.observations import USABLE, Observations, distance_to_samples, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
+from palpate_bus.messages.codes import UnassessedReason
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Marked
 
 _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""
-
-
-class UnassessedReason(IntEnum):
-    """Reason for which a place is not assessed; numbers of StiffnessMap.msg."""
-
-    ASSESSED = 0
-    NOT_REACHED = 1
-    CONTRADICTED = 2
-    YIELDED = 3
 
 
 class AssessedMap(NamedTuple):

@@ -1,7 +1,6 @@
 """From candidates to findings: how probable each is, where it ends, and how it feels against its surroundings."""
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression
 from palpate_assessment.shapes import Bump, ridge
+from palpate_bus.messages.codes import FindingKind
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Marked
 
@@ -37,16 +37,6 @@ class StatedPrior(NamedTuple):
 
 
 STATED = StatedPrior()
-
-
-class Kind(IntEnum):
-    """Causes of an area; numbers of Finding.msg."""
-
-    LUMP = 0
-    MUSCLE = 1
-    RIDGE = 2
-    BONE = 3
-    SOFT_DEFECT = 4
 
 
 class Area(NamedTuple):
@@ -75,7 +65,7 @@ class Area(NamedTuple):
     """Probability that the lump is bone."""
     soft: float
     """Probability that the lump is a soft defect of the wall, such as a hernia."""
-    kind: Kind
+    kind: FindingKind
     """Most probable kind."""
     strength: float
     """Absolute log-contrast divided by its SD."""
@@ -101,13 +91,13 @@ def areas(
         return []
     if regression.observations.standard.anatomy is None:
         logits = np.array([stated_logit(c) for c in candidates])
-        kinds = np.column_stack((expit(logits), np.zeros((len(logits), len(Kind) - 1))))
+        kinds = np.column_stack((expit(logits), np.zeros((len(logits), len(FindingKind) - 1))))
     else:
         features, signs = np.array([c.features for c in candidates]), np.array([c.signs for c in candidates])
         evidence = np.array([c.structures(marked_share(marked, c.bump)) for c in candidates])
         logits, kinds = causes(regression.observations.standard.calibration, features, signs, evidence, shift)
     found: list[Area] = []
-    for index in np.argsort(-kinds.sum(axis=1) - kinds[:, Kind.LUMP]):
+    for index in np.argsort(-kinds.sum(axis=1) - kinds[:, FindingKind.LUMP]):
         if kinds[index].sum() < CANDIDATE_PROBABILITY_MIN:
             break
         area = _area(regression, candidates[index], grid, assessed, float(logits[index]), kinds[index])
@@ -124,7 +114,7 @@ def stated_logit(candidate: Candidate) -> float:
 
 
 def causes(calibration: Calibration, features: Array, signs: Array, evidence: Array, shift: float = 0.0) -> tuple[Array, Array]:
-    """Return the logit that each candidate is a lump, shape (k,), and the probability of each `Kind`, shape (k, 5).
+    """Return the logit that each candidate is a lump, shape (k,), and the probability of each `FindingKind`, shape (k, 5).
 
     `features`, `signs`, `evidence`: of candidates, of muscles about them and of structures, shapes (k, f), (k, 2), (k, 10).
     The causes compete: a lump has the weight exp(l), a muscle exp(g), a structure s exp(l + s), nothing 1. What is softer is
@@ -138,7 +128,7 @@ def causes(calibration: Calibration, features: Array, signs: Array, evidence: Ar
     structures = (*np.where(softer, -np.inf, (scar, bone)), np.where(softer, soft, -np.inf))
     weights = np.column_stack((lump, muscle, *(lump + one for one in structures)))
     other = np.logaddexp.reduce(np.column_stack((weights[:, 1:], np.zeros(len(lump)))), axis=1)
-    weights[:, Kind.LUMP] += shift
+    weights[:, FindingKind.LUMP] += shift
     return lump - other, np.exp(weights - np.logaddexp(weights[:, :1], other[:, None]))
 
 
@@ -184,13 +174,13 @@ def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed:
         ratio=float(np.exp(middle)),
         ratio_lower=float(np.exp(middle - Z90 * sd)),
         ratio_upper=float(np.exp(middle + Z90 * sd)),
-        confidence=float(kinds[Kind.LUMP]),
+        confidence=float(kinds[FindingKind.LUMP]),
         logit=logit,
-        guarding=float(kinds[Kind.MUSCLE]),
-        ridge=float(kinds[Kind.RIDGE]),
-        bone=float(kinds[Kind.BONE]),
-        soft=float(kinds[Kind.SOFT_DEFECT]),
-        kind=Kind(int(np.argmax(kinds))),
+        guarding=float(kinds[FindingKind.MUSCLE]),
+        ridge=float(kinds[FindingKind.RIDGE]),
+        bone=float(kinds[FindingKind.BONE]),
+        soft=float(kinds[FindingKind.SOFT_DEFECT]),
+        kind=FindingKind(int(np.argmax(kinds))),
         strength=abs(candidate.t),
         length=bump.length,
     )

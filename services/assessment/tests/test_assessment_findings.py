@@ -9,13 +9,14 @@ from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 from palpate_assessment.assess import AssessedMap, assess, assess_growing
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import Candidate, Signs, signs
-from palpate_assessment.findings import Kind, causes, marked_share
+from palpate_assessment.findings import causes, marked_share
 from palpate_assessment.model import Regression, fit_log_amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
 from palpate_bus.messages import StiffnessMap
+from palpate_bus.messages.codes import FindingKind
 from palpate_models.scenario.schema import Marked
 
 REACH, FALSE_FINDINGS = 0.010, 0.02
@@ -45,7 +46,7 @@ def test_a_lump_is_found_where_and_as_it_is(contrast: float, radius: float) -> N
     centre, wall = (-0.015, 0.01), natural(4, 0.1)
     result = examine(lines(lambda xy: LEVEL + wall(xy) + lump(xy, centre, radius, contrast)))
     (found,) = result.findings
-    assert found.kind is Kind.LUMP
+    assert found.kind is FindingKind.LUMP
     assert np.linalg.norm(found.centroid[:2] - centre) < 0.004
     assert found.area == pytest.approx(np.pi * radius**2, rel=0.25)
     truth = lump(result.grid.nodes[found.nodes, :2], centre, radius, contrast)
@@ -180,12 +181,12 @@ def test_lump_muscle_and_neither_compete() -> None:
     features, muscles = (np.array(rows) for rows in zip(*((c.features, c.signs) for c in (stiff, soft, alone)), strict=True))
     evidence = np.array([c.structures() for c in (stiff, soft, alone)])
     logits, kinds = causes(load_calibration(), features, muscles, evidence)
-    guarding = kinds[:, Kind.MUSCLE]
+    guarding = kinds[:, FindingKind.MUSCLE]
     assert guarding[0] > 0.1 > guarding[2]
-    assert guarding[1] == kinds[1, Kind.BONE] == kinds[0, Kind.SOFT_DEFECT] == 0
+    assert guarding[1] == kinds[1, FindingKind.BONE] == kinds[0, FindingKind.SOFT_DEFECT] == 0
     rare, kinds_if_rare = causes(load_calibration(), features, muscles, evidence, shift=-3.0)
     assert rare == pytest.approx(logits)
-    assert (kinds_if_rare[:, Kind.LUMP] < kinds[:, Kind.LUMP]).all()
+    assert (kinds_if_rare[:, FindingKind.LUMP] < kinds[:, FindingKind.LUMP]).all()
 
 
 @pytest.mark.parametrize("conversion", [-0.2, 0.2])
@@ -213,7 +214,7 @@ def test_a_ridge_is_named_and_marked_skin_is_believed() -> None:
         result = assess(samples, flat_grid(), REACH, FALSE_FINDINGS, marked=marked)
         assert result is not None
         ridges.append(max(result.findings + result.candidates, key=lambda area: area.strength))
-    assert ridges[0].kind is Kind.RIDGE
+    assert ridges[0].kind is FindingKind.RIDGE
     assert ridges[1].ridge > ridges[0].ridge
 
 
@@ -234,4 +235,4 @@ def test_bone_is_stiff_beyond_the_border_and_steeper() -> None:
     samples = lines(lambda xy: LEVEL + 1.2 * bone(xy), exponent=lambda xy: 1.4 + 1.2 * bone(xy))
     result = examine(samples)
     assert not result.findings
-    assert max(result.candidates, key=lambda area: area.strength).kind is Kind.BONE
+    assert max(result.candidates, key=lambda area: area.strength).kind is FindingKind.BONE

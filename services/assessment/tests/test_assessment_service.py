@@ -9,10 +9,9 @@ import pytest
 from palpate.report.evidence import map_of
 from palpate.report.rows import finding_rows
 from palpate.report.scoring import Truth, score
-from palpate_assessment.assess import UnassessedReason
 from palpate_assessment.service import MAP, AssessmentService, create
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3, header, nanoseconds
+from palpate_bus.messages import ExamState, SurfaceMesh, SurfaceMotion, Vector3, header, nanoseconds
 from palpate_bus.messages.codec import encode
 from palpate_bus.service import Outbox
 from palpate_models.patient.schema import Lesion, Phantom
@@ -140,10 +139,6 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
     wrong.header = type(small.surface.header)(small.surface.header.stamp, "camera")
     with pytest.raises(ValueError, match="perception/surface"):
         service.step(0, StepInbox({"perception/surface": [wrong]}))
-
-
-def test_reasons_have_the_numbers_of_the_message() -> None:
-    assert all(getattr(StiffnessMap, reason.name) == reason for reason in UnassessedReason)
 
 
 def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from palpate_bus.messages.codes import ViewReason
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE
 from palpate_models.scenario.patterns import scan_of, stations
@@ -13,7 +14,7 @@ from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface, visibility
 from palpate_perception.cloud import CROP, Cloud, DepthFusion, FusedDepth, Intrinsics, RegionBox
 from palpate_perception.surface import FittedSurface
-from palpate_perception.visibility import Gaps, ViewReason
+from palpate_perception.visibility import Gaps
 from palpate_perception.wall import BreathingMode
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import NS, Message, PalpationTargets, SurfaceCorrection, SurfaceMotion, geometry, header, nanoseconds
+from palpate_bus.messages.codes import ViewReason
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input
@@ -14,7 +15,6 @@ from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception.cloud import Cloud, DepthFusion, Intrinsics
 from palpate_perception.follower import WATCH, Follower
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
-from palpate_perception.visibility import ViewReason
 from palpate_perception.wall import BreathingMode
 
 IMAGE: Final = "camera/depth/image_raw"

@@ -1,10 +1,10 @@
 """Coverage of the region of interest by the camera, and the reasons for gaps."""
 
-from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import ViewReason
 from palpate_models.numerics.frames import Array, Mask, apply, inverse
 from palpate_models.scenario.schema import Exam
 from palpate_perception.cloud import project
@@ -60,23 +60,6 @@ def quadric(p_A: Array, xy: Array) -> Array:
     prior = np.diag(np.sqrt(len(p_A)) * np.array([1e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4]))
     system, right = np.vstack((rows(p_A), prior)), np.concatenate((p_A[:, 2], np.zeros(6)))
     return np.asarray(rows(xy) @ np.linalg.lstsq(system, right)[0])
-
-
-class ViewReason(IntEnum):
-    """Reasons for an answer without targets; values as in `palpation_msgs/PalpationTargets`."""
-
-    NONE = 0
-    VIEW_BLOCKED = 1
-    SELF_OCCLUDED = 2
-    OUT_OF_IMAGE = 3
-    NO_DEPTH = 4
-    BEYOND_ABDOMEN = 5
-    TOO_FEW_POINTS = 6
-    PATIENT_MOVED = 7
-    NO_FRAMES = 8
-    NO_CAMERA = 9
-    NO_CALIBRATION = 10
-    BAD_FRAMES = 11
 
 
 HINTS: Final = {

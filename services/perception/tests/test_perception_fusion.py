@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from palpate_bus.messages import PalpationTargets
+from palpate_bus.messages.codes import ViewReason
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
 from palpate_perception.cloud import DepthFusion, frame_sigma
 from palpate_perception.pipeline import PIPELINE
-from palpate_perception.visibility import Gaps, ViewReason
+from palpate_perception.visibility import Gaps
 
 SHAPE = (40, 50)
 WHOLE = (slice(0, SHAPE[0]), slice(0, SHAPE[1]))
@@ -138,7 +138,3 @@ def test_largest_gap_comes_first_but_a_blocked_view_is_the_reason() -> None:
     found = gaps(all_cells(), depth)
     assert list(found.shares) == [ViewReason.NO_DEPTH, ViewReason.VIEW_BLOCKED]
     assert found.reason == ViewReason.VIEW_BLOCKED
-
-
-def test_reasons_are_those_of_the_message() -> None:
-    assert {r.name: r.value for r in ViewReason} == {r.name: getattr(PalpationTargets, r.name) for r in ViewReason}

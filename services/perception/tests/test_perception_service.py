@@ -9,6 +9,7 @@ import pytest
 from scipy.interpolate import LinearNDInterpolator
 
 from palpate_bus.messages import MS, CameraTrigger, SurfaceMotion, TFMessage, header, nanoseconds
+from palpate_bus.messages.codes import ViewReason
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
@@ -19,7 +20,6 @@ from palpate_models.scenario.patterns import lattice
 from palpate_models.scenario.schema import Scenario
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S
-from palpate_perception.visibility import ViewReason
 
 TICK = 100 * MS
 

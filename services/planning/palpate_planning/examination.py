@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
@@ -19,9 +20,9 @@ from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
-from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, count_causes
+from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, count_causes
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
-from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation, Phase
+from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead

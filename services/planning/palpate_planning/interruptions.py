@@ -6,12 +6,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.schema import Exam, Following, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.motion.timing import JerkLimitedAxis
-from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import MOVED, NO_CAUSE, Cause
 from palpate_planning.stroke import Duration
 from palpate_planning.stroke_motion import MOTION
 from palpate_planning.strokes.path import PathPoint, centre

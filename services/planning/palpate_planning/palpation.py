@@ -15,13 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning import stroke
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
-from palpate_planning.reasons import Cause, Reason
+from palpate_planning.reasons import Cause
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment

@@ -2,49 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from typing import Final, NamedTuple
 
-
-class Reason(IntEnum):
-    """Codes of `palpation_msgs/ExamState.reason`."""
-
-    NONE = 0
-    VIEW_BLOCKED = 1
-    VIEW_FAILED = 2
-    VIEW_TIMEOUT = 3
-    VIEW_UNREACHABLE = 4
-    NO_PATH = 5
-    OUT_OF_REACH = 6
-    ARM_STRETCHED = 7
-    COLLISION = 8
-    FORCE = 9
-    NO_TISSUE = 10
-    UNEXPECTED_CONTACT = 11
-    WALL_NOT_TRACKED = 12
-    WALL_HIDDEN = 13
-    CONTACT_LOST = 14
-    PATIENT_MOVED = 15
-    ARM_DISPLACED = 16
-    NO_REQUEST = 17
-    OPERATOR_STOP = 18
-    OPERATOR_END = 19
-    ROBOT_HOLD = 20
-    ROBOT_NOT_READY = 21
-    SOFT_STOP = 22
-    EMERGENCY_STOP = 23
-    NOT_RELEASED = 24
-    SERVICE_LOST = 25
-    OTHER_PATIENT = 26
-    NO_FINDINGS = 27
-    WAITS_FOR_WALL = 28
-    WAITS_FOR_BREATH = 29
-    WAITS_FOR_ARM = 30
-    WAITS_FOR_REQUEST = 31
-    WAITS_FOR_ROBOT = 32
-    WAITS_FOR_PLAN = 33
-    WAITS_FOR_PERCEPTION = 34
-    WAITS_FOR_FINDINGS = 35
+from palpate_bus.messages.codes import Reason
 
 
 class Loss(StrEnum):

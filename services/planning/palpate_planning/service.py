@@ -10,6 +10,7 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import CameraTrigger, PalpationTargets, RobotStatus, SearchRequest, SupervisorState, SurfaceMotion
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
@@ -25,8 +26,8 @@ from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import abdomen_of, correction_message, motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import SECOND
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
-from palpate_planning.status import NO_STOP, ArmStop, Observation, Phase
+from palpate_planning.reasons import NO_CAUSE, Cause
+from palpate_planning.status import NO_STOP, ArmStop, Observation
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation

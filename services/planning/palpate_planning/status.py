@@ -1,9 +1,9 @@
 """Inputs and outputs of a step of the examination, and its phases."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final, NamedTuple
 
+from palpate_bus.messages.codes import Phase
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
@@ -14,24 +14,6 @@ from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation
 from palpate_planning.wall.wall import PublishedTouch
-
-
-class Phase(IntEnum):
-    """Phases of the examination; values of `palpation_msgs/ExamState`."""
-
-    HOME = 0
-    LOOK = 1
-    PLAN = 2
-    APPROACH = 3
-    INDENT = 4
-    SCAN = 5
-    RETRACT = 6
-    RETURN = 7
-    ASSESS = 8
-    DONE = 9
-    ABORTED = 10
-    HELD = 11
-
 
 PHASE_OF: Final = {
     **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),

@@ -1,5 +1,6 @@
 """Stop, hold and resume: how an examination that is stopped continues or ends."""
 
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement
@@ -7,8 +8,8 @@ from palpate_planning.free_motion import FreeMotion
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import SECOND
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
-from palpate_planning.status import OVER, PALPATING, ExamStatus, Observation, Phase
+from palpate_planning.reasons import NO_CAUSE, Cause
+from palpate_planning.status import OVER, PALPATING, ExamStatus, Observation
 from palpate_planning.strokes.plan import ExamPlan, PerceivedAbdomen
 
 END_AFTER = SECOND

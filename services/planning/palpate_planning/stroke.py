@@ -8,8 +8,9 @@ from collections.abc import Callable, Generator
 from enum import Enum
 from typing import Final, NamedTuple, TypeVar
 
+from palpate_bus.messages.codes import Reason
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.stroke_motion import MOTION, StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS
 from palpate_planning.wall.touch import FELT_N, Onset

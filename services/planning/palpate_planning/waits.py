@@ -2,7 +2,8 @@
 
 from typing import Final, NamedTuple
 
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_bus.messages.codes import Reason
+from palpate_planning.reasons import NO_CAUSE, Cause
 
 
 class WaitTuning(NamedTuple):

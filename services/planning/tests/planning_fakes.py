@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck
+from palpate_bus.messages.codes import Phase
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr
@@ -19,7 +20,7 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
-from palpate_planning.status import ArmStop, ExamStep, Observation, Phase
+from palpate_planning.status import ArmStop, ExamStep, Observation
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface

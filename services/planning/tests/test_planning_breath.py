@@ -7,12 +7,12 @@ import pytest
 from planning_fakes import World, known
 
 from palpate_bus.messages import SurfaceMotion
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
-from palpate_planning.reasons import Cause, Reason
-from palpate_planning.status import Phase
+from palpate_planning.reasons import Cause
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from planning_fakes import FRAME, PERIOD_S, RATES, World, hertz, known
 
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
 from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
-from palpate_planning.reasons import NO_CAUSE, Cause, Loss, Reason
-from palpate_planning.status import Phase
+from palpate_planning.reasons import NO_CAUSE, Cause, Loss
 from palpate_planning.strokes.segments import STRETCHED
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, PERIOD_S, known
 
+from palpate_bus.messages.codes import Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.robot.arm import tool_pose
 from palpate_models.robot.lbr import ARM, HOME
@@ -20,7 +21,6 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import TIMING, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
-from palpate_planning.reasons import Reason
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import MOTION as STROKE_MOTION, StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath

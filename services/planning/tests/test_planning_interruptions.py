@@ -7,14 +7,14 @@ import pytest
 from planning_fakes import PERIOD_S, RATES, World, check_at_port, known
 
 from palpate_bus.contract.port_check import RefusedMessage
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import WALL, WallWatch
 from palpate_planning.motion.timing import JointTrajectory
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
-from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.wall.breath import Breath, BreathObservation
 

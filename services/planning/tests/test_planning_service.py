@@ -21,14 +21,14 @@ from palpate_bus.messages import (
     header,
     nanoseconds,
 )
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.messages.geometry import mesh_message, point_message, wrench_message
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Exam, Scenario
-from palpate_planning.reasons import Reason
 from palpate_planning.service import PlanningService, create
-from palpate_planning.status import ExamStep, Phase
+from palpate_planning.status import ExamStep
 
 OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
 

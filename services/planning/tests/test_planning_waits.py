@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, FRAME, PERIOD_S, RATES, World, check_at_port, known
 
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning import presses as requested, waits
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import BackgroundTask
 from palpate_planning.periods import SECOND
 from palpate_planning.presses import RequestedPresses
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
-from palpate_planning.status import OVER, Observation, Phase
+from palpate_planning.reasons import NO_CAUSE, Cause
+from palpate_planning.status import OVER, Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits

@@ -5,9 +5,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import StopCause, StopLevel
 from palpate_models.numerics.frames import Array
 from palpate_supervisor.senses import ForceComparison, Measurement
-from palpate_supervisor.watch import Breach, Level, StopCause
+from palpate_supervisor.watch import Breach
 
 FT, JOINTS, STATUS, EXAM = "ft/wrench", "joint_states", "robot/status", "exam/state"
 
@@ -126,7 +127,7 @@ class MotionAgreement:
             reason = "positions move against the velocities"
         else:
             return []
-        return [Breach(Level.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=STATUS)]
+        return [Breach(StopLevel.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=STATUS)]
 
 
 def _largest(x: Array) -> float:
@@ -160,14 +161,14 @@ class DepthAgreement:
         if self._wrong < self.MOST:
             return []
         reason = f"exam/state: depth = {1e3 * state.depth:.1f} mm, {1e3 * gap:.1f} mm more than the joints and its skin say"
-        return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit=EXAM)]
+        return [Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit=EXAM)]
 
 
 def _ft(reason: str) -> list[Breach]:
     """Planning retreats: it needs no force for that."""
-    return [Breach(Level.SOFT_STOP, StopCause.SENSOR, f"F/T sensor: {reason}", TUNING.never_ns, culprit=FT)]
+    return [Breach(StopLevel.SOFT_STOP, StopCause.SENSOR, f"F/T sensor: {reason}", TUNING.never_ns, culprit=FT)]
 
 
 def _joints(reason: str) -> list[Breach]:
     """The driver holds: a retreat would rely on the joints."""
-    return [Breach(Level.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=JOINTS)]
+    return [Breach(StopLevel.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=JOINTS)]

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from palpate_supervisor.watch import Breach, DriverHold, Level, StopCause
+from palpate_bus.messages.codes import HoldCause, StopCause, StopLevel
+from palpate_supervisor.watch import Breach
 
 
 class LatchTuning(NamedTuple):
@@ -22,8 +23,8 @@ class LatchTuning(NamedTuple):
 TUNING = LatchTuning()
 RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
 """Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
-_HARMLESS_HOLDS = (DriverHold.COMMAND_EXPIRED, DriverHold.FORCE_LIMIT, DriverHold.STOP_REQUESTED)
-HARMLESS = frozenset({(cause, DriverHold.NONE) for cause in (StopCause.FORCE, StopCause.SILENT)}) | {
+_HARMLESS_HOLDS = (HoldCause.COMMAND_EXPIRED, HoldCause.FORCE_LIMIT, HoldCause.STOP_REQUESTED)
+HARMLESS = frozenset({(cause, HoldCause.NONE) for cause in (StopCause.FORCE, StopCause.SILENT)}) | {
     (StopCause.DRIVER, hold) for hold in _HARMLESS_HOLDS
 }
 """Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""
@@ -33,16 +34,16 @@ class Stop(NamedTuple):
     """A latched stop at time `t` [ns]."""
 
     t: int
-    level: Level
+    level: StopLevel
     cause: StopCause
     reason: str
 
 
 class Latch:
-    """Level, cause, reason and culprit, kept until a release."""
+    """StopLevel, cause, reason and culprit, kept until a release."""
 
     def __init__(self) -> None:
-        self.level = Level.OK
+        self.level = StopLevel.OK
         self.cause = StopCause.NONE
         self.reason = self.culprit = ""
         self.releases = 0
@@ -81,9 +82,9 @@ class Latch:
                 self.cause, self.culprit, self.reason = breach.cause, breach.culprit, f"{breach.reason}; before it: {self.reason}"
         for breach in standing:
             began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
-            if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
+            if self.level is StopLevel.SOFT_STOP and t - began > breach.timeout_ns:
                 reason = f"soft stop did not help within {breach.timeout_ns / 1e6:.0f} ms: {breach.reason}"
-                self._latch(t, Breach(Level.EMERGENCY, StopCause.UNHEEDED, reason, culprit=breach.culprit))
+                self._latch(t, Breach(StopLevel.EMERGENCY, StopCause.UNHEEDED, reason, culprit=breach.culprit))
         self._causes = self._causes | {(breach.cause, breach.hold) for breach in standing} if self.level else set()
 
     def _is_over(self, t: int, breaches: Sequence[Breach]) -> bool:
@@ -113,7 +114,7 @@ class Latch:
             self.reason, self.culprit = f"release refused: {against[0].reason}", against[0].culprit
             return standing
         self._recovering = {breach.cause: breach for breach in standing if breach.cause in RECOVERABLE}
-        self.level, self.cause, self.reason, self.culprit = Level.OK, StopCause.NONE, "", ""
+        self.level, self.cause, self.reason, self.culprit = StopLevel.OK, StopCause.NONE, "", ""
         self.releases += 1
         self._released = t
         return []

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import MS, NS, OperatorRequest, RobotStatus, SupervisorState, header, nanoseconds
+from palpate_bus.messages.codes import StopCause, StopLevel
 from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
@@ -18,9 +19,9 @@ from palpate_supervisor.judge import DepthAgreement, MotionAgreement, SensorJudg
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import Breach, Level, LimitWatch, StopCause
+from palpate_supervisor.watch import Breach, LimitWatch
 
-LOSS_LEVELS = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
+LOSS_LEVELS = (("control", StopLevel.EMERGENCY), ("planning", StopLevel.EMERGENCY), ("assessment", StopLevel.SOFT_STOP))
 """Stop level when a role is lost. Without control or planning the arm must stand still; without assessment pressing is
 pointless."""
 WATCHED = ("robot/status", "exam/state")
@@ -78,14 +79,14 @@ class SupervisorService(Service):
         breaches = self._presence(t, inbox)
         for request in inbox.new("operator/request"):
             if request.request == OperatorRequest.STOP:
-                breaches.append(Breach(Level.EMERGENCY, StopCause.OPERATOR, f"stopped by the operator: {request.reason}"))
+                breaches.append(Breach(StopLevel.EMERGENCY, StopCause.OPERATOR, f"stopped by the operator: {request.reason}"))
             elif request.request == OperatorRequest.SOFT_STOP:
-                breaches.append(Breach(Level.SOFT_STOP, StopCause.OPERATOR, f"soft stop by the operator: {request.reason}"))
+                breaches.append(Breach(StopLevel.SOFT_STOP, StopCause.OPERATOR, f"soft stop by the operator: {request.reason}"))
             elif request.request in (OperatorRequest.RELEASE, OperatorRequest.END):
                 release = True
             else:
                 reason = f"operator/request: unknown request {request.request} is treated as a stop"
-                breaches.append(Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="operator/request"))
+                breaches.append(Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit="operator/request"))
         for mesh in inbox.new("perception/surface"):
             breaches += self._take_surface(mesh)
         if inbox.new("robot/status"):
@@ -130,7 +131,7 @@ class SupervisorService(Service):
             received = inbox.stamp(name)
             if received is not None and t - received > self._max_age:
                 reason = f"no message on {name} for {(t - received) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-                found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason, culprit=name))
+                found.append(Breach(StopLevel.EMERGENCY, StopCause.SILENT, reason, culprit=name))
         return found
 
     def _take_surface(self, mesh: Any) -> list[Breach]:
@@ -141,7 +142,7 @@ class SupervisorService(Service):
             normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
             self._surface = RestSurface(vertices, normals, self._radius)
         except ValueError as error:
-            return [Breach(Level.SOFT_STOP, StopCause.INVALID, f"perception/surface: {error}", culprit="perception/surface")]
+            return [Breach(StopLevel.SOFT_STOP, StopCause.INVALID, f"perception/surface: {error}", culprit="perception/surface")]
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
@@ -152,7 +153,7 @@ class SupervisorService(Service):
         wrong = next((name for name, value in measured._asdict().items() if not isfinite(value.dot(value))), "")
         if wrong:
             reason = f"robot/status: {wrong} = {getattr(measured, wrong)}: must be finite"
-            return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
+            return [Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS
@@ -171,10 +172,10 @@ class SupervisorService(Service):
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
             reason = f"robot/status repeats a measurement of age {age}"
-            found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
+            found.append(Breach(StopLevel.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
             reason = f"safe hold of the driver: {status.reason}"
-            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
+            found.append(Breach(StopLevel.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
         return found
 
 

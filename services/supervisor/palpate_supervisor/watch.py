@@ -1,11 +1,11 @@
 """Compares measurements with the scenario's limits. Numbers in, breaches out."""
 
 from collections import deque
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import HoldCause, StopCause, StopLevel
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import Tool
@@ -39,44 +39,10 @@ class SupervisorTuning(NamedTuple):
 TUNING = SupervisorTuning()
 
 
-class Level(IntEnum):
-    """Values of `palpation_msgs/SupervisorState.level`."""
-
-    OK = 0
-    SOFT_STOP = 1
-    EMERGENCY = 2
-
-
-class StopCause(IntEnum):
-    """Values of `palpation_msgs/SupervisorState.cause`."""
-
-    NONE = 0
-    FORCE = 1
-    DEPTH = 2
-    SPEED = 3
-    WORKSPACE = 4
-    LOST = 5
-    SILENT = 6
-    INVALID = 7
-    OPERATOR = 8
-    DRIVER = 9
-    UNHEEDED = 10
-    SENSOR = 11
-
-
-class DriverHold(IntEnum):
-    """Values of `palpation_msgs/RobotStatus.cause`, why the driver holds, that a release depends on."""
-
-    NONE = 0
-    COMMAND_EXPIRED = 1
-    FORCE_LIMIT = 7
-    STOP_REQUESTED = 8
-
-
 class Breach(NamedTuple):
     """A limit that is violated now. `cause` is the code to act on; `reason` is text for people."""
 
-    level: Level
+    level: StopLevel
     cause: StopCause
     reason: str
     timeout_ns: int = TUNING.soft_stop_timeout_ns
@@ -85,7 +51,7 @@ class Breach(NamedTuple):
     """Distance beyond the limit of depth or workspace."""
     culprit: str = ""
     """Role or topic that is missing or invalid."""
-    hold: int = DriverHold.NONE
+    hold: int = HoldCause.NONE
     """Cause of the driver's hold."""
 
 
@@ -127,15 +93,15 @@ class LimitWatch:
             return []
         found = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
         if not soon <= limits.force_emergency_n:
-            return [Breach(Level.EMERGENCY, StopCause.FORCE, f"{found}, emergency limit {limits.force_emergency_n:g} N")]
+            return [Breach(StopLevel.EMERGENCY, StopCause.FORCE, f"{found}, emergency limit {limits.force_emergency_n:g} N")]
         timeout = TUNING.rising_timeout_ns if rising else TUNING.soft_stop_timeout_ns
-        return [Breach(Level.SOFT_STOP, StopCause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
+        return [Breach(StopLevel.SOFT_STOP, StopCause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
 
     def _depth(self, depth: float) -> list[Breach]:
         limit = self._limits.depth_m + TUNING.depth_margin_m
         if depth <= limit:
             return []
-        level = Level.EMERGENCY if depth > limit + TUNING.depth_margin_m else Level.SOFT_STOP
+        level = StopLevel.EMERGENCY if depth > limit + TUNING.depth_margin_m else StopLevel.SOFT_STOP
         reason = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
         return [Breach(level, StopCause.DEPTH, reason, beyond_m=depth - limit)]
 
@@ -143,11 +109,11 @@ class LimitWatch:
         free = self._limits.speed_mps * TUNING.speed_margin
         if not speed <= free:  # also for NaN
             reason = f"robot/status: tool speed {speed:.2f} m/s, limit {free:.2f} m/s"
-            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
+            return [Breach(StopLevel.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
         contact = self._limits.contact_speed_mps
         if force > TUNING.contact_n and speed > contact:
             reason = f"robot/status: tool speed {speed:.2f} m/s at {force:.1f} N, limit in contact {contact:.2f} m/s"
-            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
+            return [Breach(StopLevel.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
         return []
 
     def _workspace(self, p_W: Array) -> list[Breach]:
@@ -157,4 +123,4 @@ class LimitWatch:
         if beyond[k] <= 0.0:
             return []
         reason = f"tool at {'xyz'[k]} = {p_A[k]:.3f} m in the abdomen frame, allowed {low[k]:g} to {high[k]:g} m"
-        return [Breach(Level.EMERGENCY, StopCause.WORKSPACE, reason, beyond_m=float(beyond[k]))]
+        return [Breach(StopLevel.EMERGENCY, StopCause.WORKSPACE, reason, beyond_m=float(beyond[k]))]

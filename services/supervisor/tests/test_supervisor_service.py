@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 
 from palpate_bus.messages import MS, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench, header
+from palpate_bus.messages.codes import StopCause, StopLevel
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
@@ -20,7 +21,7 @@ from palpate_supervisor.latch import Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.service import SupervisorService, create
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import TUNING, Breach, Level, LimitWatch, StopCause
+from palpate_supervisor.watch import TUNING, Breach, LimitWatch
 
 KNOWN = exam_input(load_scenario("clean"))
 
@@ -50,18 +51,18 @@ def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth
 @pytest.mark.parametrize(
     ("values", "level", "cause"),
     [
-        ({"force": 26.0}, Level.SOFT_STOP, StopCause.FORCE),
-        ({"force": 41.0}, Level.EMERGENCY, StopCause.FORCE),
-        ({"speed": 0.7}, Level.EMERGENCY, StopCause.SPEED),
-        ({"speed": 0.3, "force": 6.0}, Level.EMERGENCY, StopCause.SPEED),
-        ({"depth": 0.047, "force": 9.0}, Level.SOFT_STOP, StopCause.DEPTH),
-        ({"depth": 0.047}, Level.SOFT_STOP, StopCause.DEPTH),
-        ({"depth": 0.071, "force": 9.0}, Level.EMERGENCY, StopCause.DEPTH),
-        ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, StopCause.WORKSPACE),
-        ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, StopCause.WORKSPACE),
+        ({"force": 26.0}, StopLevel.SOFT_STOP, StopCause.FORCE),
+        ({"force": 41.0}, StopLevel.EMERGENCY, StopCause.FORCE),
+        ({"speed": 0.7}, StopLevel.EMERGENCY, StopCause.SPEED),
+        ({"speed": 0.3, "force": 6.0}, StopLevel.EMERGENCY, StopCause.SPEED),
+        ({"depth": 0.047, "force": 9.0}, StopLevel.SOFT_STOP, StopCause.DEPTH),
+        ({"depth": 0.047}, StopLevel.SOFT_STOP, StopCause.DEPTH),
+        ({"depth": 0.071, "force": 9.0}, StopLevel.EMERGENCY, StopCause.DEPTH),
+        ({"p_W": np.array([0.56, 0.0, 0.80])}, StopLevel.EMERGENCY, StopCause.WORKSPACE),
+        ({"p_W": np.array([0.56, 0.7, 1.2])}, StopLevel.EMERGENCY, StopCause.WORKSPACE),
     ],
 )
-def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: Level, cause: StopCause) -> None:
+def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: StopLevel, cause: StopCause) -> None:
     (breach,) = judge(**values)  # type: ignore[arg-type]
     assert (breach.level, breach.cause) == (level, cause)
     assert (breach.beyond_m > 0) == (cause in (StopCause.DEPTH, StopCause.WORKSPACE))
@@ -163,9 +164,11 @@ def test_a_press_before_the_arm_moves_is_no_bias() -> None:
 
 
 def test_a_sensor_that_was_found_wrong_explains_an_earlier_stop() -> None:
-    force = Breach(Level.EMERGENCY, StopCause.FORCE, "external force 30 N")
-    latch = latch_after([force], [force, Breach(Level.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")])
-    assert (latch.level, latch.cause, latch.culprit) == (Level.EMERGENCY, StopCause.SENSOR, "ft/wrench")
+    force = Breach(StopLevel.EMERGENCY, StopCause.FORCE, "external force 30 N")
+    latch = latch_after(
+        [force], [force, Breach(StopLevel.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")]
+    )
+    assert (latch.level, latch.cause, latch.culprit) == (StopLevel.EMERGENCY, StopCause.SENSOR, "ft/wrench")
     assert "external force 30 N" in latch.reason
 
 
@@ -199,10 +202,10 @@ def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
         RestSurface(bad, bad, 0.015)
 
 
-SOFT = Breach(Level.SOFT_STOP, StopCause.FORCE, "26 N")
-EMERGENCY = Breach(Level.EMERGENCY, StopCause.FORCE, "41 N")
-DEPTH = Breach(Level.SOFT_STOP, StopCause.DEPTH, "27 mm")
-DRIVER = Breach(Level.EMERGENCY, StopCause.DRIVER, "the driver holds")
+SOFT = Breach(StopLevel.SOFT_STOP, StopCause.FORCE, "26 N")
+EMERGENCY = Breach(StopLevel.EMERGENCY, StopCause.FORCE, "41 N")
+DEPTH = Breach(StopLevel.SOFT_STOP, StopCause.DEPTH, "27 mm")
+DRIVER = Breach(StopLevel.EMERGENCY, StopCause.DRIVER, "the driver holds")
 
 
 RELEASE = "the operator releases"
@@ -218,29 +221,29 @@ def latch_after(*steps: list[Breach | str]) -> Latch:
 
 def test_a_stop_stands_when_its_cause_has_gone() -> None:
     latch = latch_after([SOFT], [])
-    assert (latch.level, latch.cause, latch.reason) == (Level.SOFT_STOP, StopCause.FORCE, "26 N")
+    assert (latch.level, latch.cause, latch.reason) == (StopLevel.SOFT_STOP, StopCause.FORCE, "26 N")
     latch = latch_after([SOFT], [], [RELEASE])
-    assert (latch.level, latch.releases) == (Level.OK, 1)
+    assert (latch.level, latch.releases) == (StopLevel.OK, 1)
 
 
 def test_the_worst_counts_and_the_first_of_equals() -> None:
     latch = latch_after([SOFT, EMERGENCY], [DRIVER, SOFT])
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.FORCE)
-    assert [stop.level for stop in latch.stops] == [Level.EMERGENCY]
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.FORCE)
+    assert [stop.level for stop in latch.stops] == [StopLevel.EMERGENCY]
 
 
 def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
     steps = TUNING.soft_stop_timeout_ns // (10 * MS) + 1
-    assert latch_after(*[[SOFT]] * steps).level is Level.SOFT_STOP
+    assert latch_after(*[[SOFT]] * steps).level is StopLevel.SOFT_STOP
     latch = latch_after(*[[SOFT]] * (steps + 1))
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
     assert "26 N" in latch.reason
 
 
 def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
-    rising = Breach(Level.SOFT_STOP, StopCause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
+    rising = Breach(StopLevel.SOFT_STOP, StopCause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
     latch = latch_after(*[[rising]] * (TUNING.rising_timeout_ns // (10 * MS) + 2))
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
 
 
 @pytest.mark.parametrize(
@@ -251,55 +254,55 @@ def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
         (DRIVER._replace(hold=RobotStatus.CAUSE_COMMAND_EXPIRED), True),
         (DRIVER._replace(hold=RobotStatus.CAUSE_VELOCITY_LIMIT), False),
         (DEPTH, False),
-        (Breach(Level.SOFT_STOP, StopCause.OPERATOR, "soft stop by the operator"), False),
+        (Breach(StopLevel.SOFT_STOP, StopCause.OPERATOR, "soft stop by the operator"), False),
     ],
 )
 def test_only_a_harmless_cause_that_is_over_is_released_alone_and_not_often(breach: Breach, alone: bool) -> None:
     latch, over, held = Latch(), latch_module.TUNING.over_ns, DRIVER._replace(hold=RobotStatus.CAUSE_STOP_REQUESTED)
-    later = [] if breach.level is Level.SOFT_STOP else [breach if breach.cause is StopCause.DRIVER else held]
+    later = [] if breach.level is StopLevel.SOFT_STOP else [breach if breach.cause is StopCause.DRIVER else held]
     t = 0
     for _ in range(latch_module.TUNING.own_releases_max if alone else 1):
         latch.update(t, [breach], False)
         latch.update(t + over, later, False)
         assert latch.level is breach.level, "not over for long enough"
         latch.update(t + over + 10 * MS, later, False)
-        assert (latch.level is Level.OK) is alone
+        assert (latch.level is StopLevel.OK) is alone
         t += 2 * over
     latch.update(t, [breach], False)
     latch.update(t + 2 * over, later, False)
-    assert latch.level is not Level.OK
+    assert latch.level is not StopLevel.OK
 
 
 def test_a_release_is_refused_while_the_cause_stands() -> None:
     refused = [[EMERGENCY], [EMERGENCY, RELEASE]]
-    assert (latch_after(*refused).level, latch_after(*refused).reason) == (Level.EMERGENCY, "release refused: 41 N")
-    for steps, expected in ([[]], (Level.EMERGENCY, 1, 0)), ([[], [RELEASE]], (Level.OK, 1, 1)):
+    assert (latch_after(*refused).level, latch_after(*refused).reason) == (StopLevel.EMERGENCY, "release refused: 41 N")
+    for steps, expected in ([[]], (StopLevel.EMERGENCY, 1, 0)), ([[], [RELEASE]], (StopLevel.OK, 1, 1)):
         latch = latch_after(*refused, *steps)
         assert (latch.level, latch.refusals, latch.releases) == expected
 
 
 def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:
     released = [[DEPTH], [DEPTH, RELEASE], [DEPTH]]
-    assert latch_after(*released).level is Level.OK
-    assert latch_after(*released, [], [DEPTH]).level is Level.SOFT_STOP
+    assert latch_after(*released).level is StopLevel.OK
+    assert latch_after(*released, [], [DEPTH]).level is StopLevel.SOFT_STOP
 
 
 def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
-    latch = latch_after([DEPTH], [DEPTH, RELEASE], [DEPTH._replace(level=Level.EMERGENCY)])
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.DEPTH)
+    latch = latch_after([DEPTH], [DEPTH, RELEASE], [DEPTH._replace(level=StopLevel.EMERGENCY)])
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.DEPTH)
 
 
 def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
     latch = latch_after(*([[SOFT], []] * (TUNING.soft_stop_timeout_ns // (20 * MS) + 2)))
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
     latch = Latch()
-    latch.update(0, [Breach(Level.SOFT_STOP, StopCause.OPERATOR, "enough")], False)
+    latch.update(0, [Breach(StopLevel.SOFT_STOP, StopCause.OPERATOR, "enough")], False)
     for t in range(1000 * MS, 1000 * MS + TUNING.soft_stop_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [SOFT], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
@@ -307,17 +310,17 @@ def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
     latch.update(0, [DRIVER], False)
     latch.update(10 * MS, [DRIVER], True)
     latch.update(20 * MS, [DRIVER], False)
-    assert latch.level is Level.OK
+    assert latch.level is StopLevel.OK
     latch.update(10 * MS + latch_module.TUNING.driver_grace_ns, [DRIVER], False)
     assert latch.cause is StopCause.DRIVER
 
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
-    outside = Breach(Level.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
+    outside = Breach(StopLevel.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
     near, far = (outside._replace(beyond_m=0.02 + share * latch_module.TUNING.further_m) for share in (0.9, 1.1))
-    assert latch_after([outside], [outside, RELEASE], [near]).level is Level.OK
+    assert latch_after([outside], [outside, RELEASE], [near]).level is StopLevel.OK
     latch = latch_after([outside], [outside, RELEASE], [near], [far])
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.WORKSPACE)
+    assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.WORKSPACE)
 
 
 def status(stamp: int, force: float) -> RobotStatus:

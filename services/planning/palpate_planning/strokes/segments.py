@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from palpate_bus.messages.codes import Reason
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JointTrajectory
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.strokes.coverage import Stroke, transfer
 from palpate_planning.strokes.path import SurfacePath, centre, frames_along, least_twist
 from palpate_planning.wall.surface import PerceivedSurface
