@@ -1,6 +1,6 @@
 """Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
@@ -8,12 +8,14 @@ from typing import Annotated, Any, Final, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from palpate_errors import UserError
-from palpate_inputs import read_yaml
+from palpate_inputs import brief, read_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Length = Annotated[float, Field(gt=0, le=1)]
 """Length [m] on the patient; the limit rejects values in millimetres."""
+Turn = Annotated[float, Field(ge=-6.3, le=6.3)]
+"""Angle [rad]; the limit rejects values in degrees."""
 Force = Annotated[float, Field(gt=0, le=100)]
 """Force [N]."""
 UNITS: Final = {
@@ -71,12 +73,41 @@ def read_model(path: Path, model: type[_M], error: type[UserError] = UserError) 
     except OSError as problem:
         raise error(f"{path}: {problem}") from problem
     except ValidationError as problem:
-        wrong = [
-            (e["loc"], unknown_field(str(e["loc"][-1]), model) if e["type"] == "extra_forbidden" else e["msg"])
-            for e in problem.errors()
-        ]
-        text = "; ".join(f"{'.'.join(map(str, field)) or 'the file'}: {what}" for field, what in wrong)
+        wrong = [(brief(item["input"]), *explain_error(item, model)) for item in problem.errors()]
+        text = "; ".join(f"{'.'.join(field) or 'the file'} = {value}: {what}" for value, field, what in wrong)
         raise error(f"{path}: {text}") from problem
+
+
+_NO_SECTION: Final = frozenset(("model_type", "model_attributes_type", "dict_type"))
+"""pydantic's error types for a value in place of a section."""
+_NUMBERS: Final = frozenset(("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_parsing", "float_type"))
+"""pydantic's error types for a number out of bounds and for a value that is not a number."""
+
+
+def explain_error(item: Mapping[str, Any], model: type[BaseModel]) -> tuple[list[str], str]:
+    """Return the field of an error of pydantic, and what is wrong with it or allowed there."""
+    field = [str(part) for part in item["loc"]]
+    what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "expected ")
+    if item["type"] == "extra_forbidden":
+        what = unknown_field(field[-1], model)
+    elif item["type"] in _NO_SECTION:
+        what = "expected a section, a mapping of fields"
+    elif item["type"] == "missing":
+        last = field.pop()
+        what = f"expected at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
+    elif item["type"] == "tuple_type":
+        what = "expected a list of values in square brackets"
+    elif item["type"] == "too_long":
+        what = f"expected at most {item['ctx']['max_length']} values"
+    elif item["type"] in _NUMBERS and (unit := _unit(field)):
+        what += f" (in {unit})"
+    return field, what
+
+
+def _unit(field: Sequence[str]) -> str | None:
+    """Return the unit at the end of a field's name: metres for `exam.region_m.0`."""
+    name = next((part for part in reversed(field) if not part.isdigit()), "")
+    return UNITS.get(name.rpartition("_")[2]) if "_" in name else None
 
 
 def did_you_mean(word: str, known: Collection[str]) -> str:

@@ -10,7 +10,8 @@ import yaml
 
 from palpate_errors import UserError
 from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose, urdf
-from palpate_models.robot.urdf_arm import enclosing_capsule, read_arm
+from palpate_models.robot.fitting import enclosing_capsule, seeds_of
+from palpate_models.robot.urdf_arm import read_arm
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
 
@@ -18,13 +19,14 @@ TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "
 TENSOR = '<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><origin xyz="0 0 0.05"/><mass value="{{m}}"/>{TENSOR}</inertial>'
 XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>'
+FIELDS = ("flange", "home_rad", "urdf", "base", "base_heigth_m", "base_yaw_rad", "seeds_rad", "lower_rad")
 GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 
 
 def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: Any) -> str:
     """Return the YAML file of an arm of six joints; `changes` replace parts of its third joint and link, or of the YAML file."""
     given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
-        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "base", "base_heigth_m")
+        key: value for key, value in changes.items() if key in FIELDS
     }
     links = ['<link name="link_0"/>']
     for k, rpy in enumerate(TWISTS, start=1):
@@ -107,7 +109,10 @@ BROKEN = {
     "no child": ({"swap": ('<child link="link_3"/>', "")}, "joint joint_3: no link ''"),
     "loop": ({"swap": ('parent link="link_0"', 'parent link="link_6"')}, "link link_6: its joints form a circle"),
     "two roots": ({"swap": ("</robot>", '<link name="x"/></robot>')}, "links link_0, x: 2 roots"),
-    "two joints above": ({"swap": ('child link="gripper"', 'child link="link_3"')}, "link link_3: has two joints above it"),
+    "two joints above": (
+        {"swap": ('child link="gripper"', 'child link="link_3"')},
+        "link link_3: has two joints above it, joint_3 and slide",
+    ),
     "name twice": ({"swap": ('<link name="link_0"/>', '<link name="link_0"/>' * 2)}, "link 'link_0': 2 of this name"),
     "joint without name": ({"swap": ('joint name="joint_3"', "joint")}, "joint ''"),
     "mimic": ({"limit": '<mimic joint="joint_2"/>'}, "joint joint_3: mimics"),
@@ -129,8 +134,23 @@ BROKEN = {
         "link link_3: mesh arm.urdf cannot be read",
     ),
     "no base": ({"base": "gripper"}, "base: no link 'gripper' before tip; it has link_0, link_1"),
-    "base too far": ({"base": "link_1"}, "5 joints from link_1 to tip, expected 6 or 7 that turn; where the arm is part"),
-    "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, expected 6"),
+    "base too far": ({"base": "link_1"}, "5 joints from link_1 to tip; expected 6 or 7 joints that turn"),
+    "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: expected 6 values, one per joint, not 4"),
+    "one limit": ({"lower_rad": [-1.0]}, "lower_rad: expected 6 values, one per joint, not 1"),
+    "short seed": ({"seeds_rad": [[0.0]]}, "seeds_rad: expected 6 values, one per joint, not 1"),
+    "degrees": (
+        {"limit": '<limit lower="-123" upper="60" velocity="2" effort="80"/>'},
+        "range is -123 to 60 rad: its unit is not",
+    ),
+    "no inertial but of a screw": ({"inertia": {"m": 1e-4, "x": 1e-6, "y": 1e-6, "z": 1e-6}}, "link link_3: no mass: 0.0001 kg"),
+    "slides behind a base": (
+        {"kind": "prismatic", "base": "link_0"},
+        "is prismatic, between link_0 and tip; expected 6 or 7 joints",
+    ),
+    "flange that points aside": (
+        {"swap": ('rpy="0 0.4 0"', 'rpy="0 1.6 0"')},
+        "z of tip does not point out of the arm: write `flange",
+    ),
 }
 
 
@@ -162,10 +182,13 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
     trimesh.creation.box((80.0, 80.0, 200.0)).export(tmp_path / "link.stl")
     mesh = '<geometry><mesh filename="link.stl"{}/></geometry>'
     _, faults = read_arm(write(tmp_path, collision=mesh.format("")))
-    assert "its unit is not metres" in faults[0]
-    (tmp_path / "scaled").mkdir()
-    (tmp_path / "scaled" / "link.stl").write_bytes((tmp_path / "link.stl").read_bytes())
+    assert "its unit is not metres; give a scale in the URDF" in faults[0]
+    for folder in ("scaled", "twice"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "link.stl").write_bytes((tmp_path / "link.stl").read_bytes())
     assert read_arm(write(tmp_path / "scaled", collision=mesh.format(' scale="0.001 0.001 0.001"')))[1] == []
+    twice = read_arm(write(tmp_path / "twice", collision=mesh.format(' scale="2 2 2"')))
+    assert "change its scale, 2 2 2, in the URDF" in twice[1][0]
 
 
 @pytest.mark.parametrize(
@@ -174,8 +197,9 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
         ({"text": "<robot"}, "not a URDF"),
         ({"text": "<sdf/>"}, "its root element is sdf"),
         ({"text": XACRO}, "has xacro elements"),
-        ({"urdf": "other.urdf"}, "other.urdf"),
-        ({"base_heigth_m": 1}, r"base_heigth_m: unknown field\. Did you mean base_height_m\?"),
+        ({"urdf": "other.urdf"}, r"arm\.yaml: urdf: .*other\.urdf: no such file"),
+        ({"base_heigth_m": 1}, r"base_heigth_m = 1: unknown field\. Did you mean base_height_m\?"),
+        ({"base_yaw_rad": -90}, r"base_yaw_rad = -90: expected greater than or equal to -6\.3 \(in radians\)"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
@@ -224,9 +248,9 @@ def test_inverse_kinematics_starts_from_several_postures(tmp_path: Path) -> None
     """From home alone TIAGo's arm reached 5 of 18 targets in a place where it reaches all."""
     arm, faults = read_arm(write(tmp_path))
     assert arm is not None, faults
-    assert arm.seeds_rad[0] == tuple(arm.home_rad)
-    assert len(arm.seeds_rad) > 1
-    assert read_arm("ur5")[0].seeds_rad == (tuple(read_arm("ur5")[0].home_rad),)  # type: ignore[union-attr]
+    assert seeds_of(arm)[0] == tuple(arm.home_rad)
+    assert len(seeds_of(arm)) > 1
+    assert seeds_of(read_arm("ur5")[0]) == (tuple(read_arm("ur5")[0].home_rad),)  # type: ignore[arg-type, union-attr]
 
 
 def test_a_capsule_encloses_its_points() -> None:

@@ -1,11 +1,10 @@
-"""The place of an arm: where its base should stand, and what its shapes touch.
+"""The place of an arm: where its base should stand.
 
 The optimal pose of the base is its x, y, height and yaw, together with a posture for each of a grid of targets. They cover the
 examined region of the abdomen and a border around it, in contact and raised along their normals, for approach and retreat, other
 patients and registration errors.
 """
 
-from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -14,19 +13,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from palpate.run.clearance import clear_postures, scan_targets
 from palpate_errors import RunError
-from palpate_models.numerics.frames import Array, Mask, apply, matrix
-from palpate_models.patient.phantom import build_phantom
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.robot.arm import arm_of
-from palpate_models.robot.chain import Arm
-from palpate_models.robot.fitting import ready_postures
-from palpate_models.robot.table import BASE_SIDE_M, TABLE, boxes
-from palpate_models.robot.urdf_arm import flange_advice, home_advice
-from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file, arm_path
-from palpate_models.scenario.load import true_pose
-from palpate_models.scenario.schema import Exam, Limits, Robot, Scenario
-from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.scene import CollisionScene
+from palpate_models.robot.table import BASE_SIDE_M, TABLE
+from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement.redundancy import POSTURES, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
@@ -53,54 +45,31 @@ STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (
 """Placements to start from, after the robot's own; the best result counts, as the problem is not convex."""
 
 
-def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:
-    """Return origins of the indenter [m] at `exam.depth_m` below the surface and outward normals, in world, shapes (n, 3).
-
-    They lie in snake order on a grid of at most `spacing` over the examined region widened by `border`; `raised` lifts
-    them along their normals. Normals are averaged over the indenter's footprint.
-    """
-    exam: Exam = scenario.exam
-    model = build_phantom(scenario.phantom, scenario.seed)
-    X_WA = matrix(true_pose(scenario))
-    front = model.normals[:, 2] > 0.2
-    vertices, normals = model.vertices[front], model.normals[front]
-    half = np.asarray(exam.region_m) / 2 + border
-    x, y = (np.linspace(c - h, c + h, int(np.ceil(2 * h / spacing)) + 1) for c, h in zip(exam.centre_m, half, strict=True))
-    xy = np.array([(a, b) for i, b in enumerate(y) for a in (x if i % 2 == 0 else x[::-1])])
-    distance = np.linalg.norm(vertices[None, :, :2] - xy[:, None], axis=2)
-    weight = np.exp(-0.5 * (distance / (scenario.robot.indenter_radius_m / 2)) ** 2)
-    n = weight @ normals
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
-    z = (weight @ vertices[:, 2]) / weight.sum(axis=1)
-    offset = scenario.robot.indenter_radius_m - exam.depth_m + raised
-    return apply(X_WA, np.column_stack((xy, z)) + offset * n), n @ X_WA[:3, :3].T
-
-
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
     """Return the robot on the base placement with the lowest cost over the scenario's region.
 
-    It is rounded to centimetres and hundredths of a radian. A placement counts whose targets inverse kinematics reaches, as an
-    examination has to. Raises RunError with the best attempt if there is none.
+    It is rounded to centimetres and hundredths of a radian. A placement counts whose targets inverse kinematics reaches and
+    where no shapes touch, as in an examination. Raises RunError with the best attempt if there is none.
     """
     contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
     raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
     starts = (base_of(scenario.robot), *map(np.array, STARTS))
     attempts = [_optimise(scenario.robot, positions, normals, start) for start in starts]
-    home, tried = arm_of(scenario.robot).home_rad, []
+    tried = []
     converged = [pair for pair in attempts if pair[0] < np.inf]
     for _, robot in sorted(converged or attempts, key=itemgetter(0)):
-        postures = plan_redundancy(robot, positions, normals, home)
+        postures, touched = clear_postures(robot, positions, normals, scenario.limits)
         if converged and postures.reachable.all():
             return robot
-        tried.append((robot, postures))
-    robot, postures = max(tried, key=lambda pair: pair[1].reachable.sum())
+        tried.append((robot, postures, touched))
+    robot, postures, touched = max(tried, key=lambda one: one[1].reachable.sum())
     if converged and postures.reachable.any():
         return robot
-    best = describe(robot, postures)
+    change = "The robot's base_xy_m, base_height_m and base_yaw_rad are tried first: give others, or a smaller exam.region_m"
     raise RunError(
-        f"no base placement found; the best attempt is at {best}. The robot's base_xy_m, base_height_m and base_yaw_rad are "
-        "tried first: give others, or a smaller exam.region_m"
+        f"no base placement found, tried on {len(positions)} sampled targets; the best attempt is at "
+        f"{describe(robot, postures)}. {touched or change}"
     )
 
 
@@ -160,48 +129,7 @@ def describe(robot: Robot, postures: PostureSequence) -> str:
     )
 
 
-def home_origin(name: str) -> str:
-    """Return a text on a home posture that the arm's file does not have; empty if it has one."""
-    missing = name != DEFAULT_ARM and arm_file(name).home_rad is None
-    return f"sought, as {arm_path(name).name} has none" if missing else ""
-
-
-def flange_note(name: str, found: Arm) -> str:
-    """Return what to write if the flange's z does not point out of the arm; empty if it does."""
-    if name == DEFAULT_ARM:
-        return ""
-    return flange_advice(found, arm_file(name), arm_path(name).name)
-
-
-def advice(name: str, robot: Robot | None = None) -> str:
-    """Return what to write where an arm touches itself at home, or the surroundings of `robot`."""
-    found = arm_of(robot or Robot(arm=name))
-    if name == DEFAULT_ARM:
-        return "move the base by hand"
-    if wrong := flange_note(name, found):
-        return wrong
-    for home in ready_postures(found):
-        if not touching(name, home, robot):
-            return f"write `home_rad: {home.tolist()}` in {arm_path(name).name}, which is clear"
-    return home_advice(found, arm_file(name), arm_path(name).name)
-
-
-def touching(name: str, q: Array, at: Robot | None = None) -> list[str]:
-    """Return the pairs of shapes of an arm, tool included, that are too close at `q` [rad], wherever its base stands.
-
-    With `at`, also those of the arm and the table or base there.
-    """
-    robot = at or Robot(arm=name)
-    found = _scene(robot).collisions(q)
-    return [pair for pair in found if at is not None or not any(pair.endswith(box.name) for box in boxes(robot))]
-
-
-@cache
-def _scene(robot: Robot) -> CollisionScene:
-    return CollisionScene(ArmKinematics(robot, Limits()), robot)
-
-
-def draw_reach(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:
+def draw_reach(path: Path, scenario: Scenario, positions: Array, reached: Mask, base_xy: tuple[float, float]) -> None:
     """Draw the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
     figure = Figure(figsize=(6.5, 6.5), dpi=110, layout="constrained")
     axes = figure.add_subplot()
@@ -209,7 +137,7 @@ def draw_reach(path: Path, scenario: Scenario, positions: Array, reached: Array,
     axes.add_patch(Rectangle((TABLE.x_m[0], TABLE.y_m[0]), width, length, fill=False, color="#7a8c94", label="table"))
     corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
     axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
-    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "out of reach")):
+    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "not reached")):
         if chosen.any():
             axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
     title = f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets"

@@ -15,6 +15,7 @@ from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.scenario.arm_file import DEFAULT_ARM
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.patterns import Scan, Surface, scan_of, touch_centres
 from palpate_models.scenario.schema import PATTERN, Exam, Mode, Scenario
@@ -126,8 +127,8 @@ def check_usable(
 ) -> Scenario:
     """Return a scenario whose phantom can be made and whose services exist. Raises UserError for any other.
 
-    `services`: choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines and are not
-    checked here.
+    `services`: choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines, and they and the
+    arm are not checked here.
     """
     try:
         return check_examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
@@ -136,13 +137,17 @@ def check_usable(
 
 
 def check_examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
-    """Return the scenario after its phantom, its scan and, unless they run `elsewhere`, its services were checked.
+    """Return the scenario after its phantom, its scan and, unless they run `elsewhere`, its arm and services were checked.
 
-    Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service.
+    Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service, UserError for an arm.
     """
     if is_file(pattern := scenario.exam.pattern):  # services have other working directories
         exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
         scenario = scenario.model_copy(update={"exam": exam})
     if scenario.services.tissue != NONE:
         scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
+        if scenario.robot.arm != DEFAULT_ARM and not elsewhere:
+            from palpate.run.clearance import check_clear  # noqa: PLC0415 - it imports pinocchio
+
+            check_clear(scenario)
     return scenario if elsewhere else check_choices(scenario)

@@ -73,7 +73,7 @@ class Arm:
     capsules: tuple[tuple[Capsule, ...], ...]
     """Shape of the same links."""
     seeds_rad: tuple[tuple[float, ...], ...] = ()
-    """Further postures from which inverse kinematics starts, with the first joint at zero."""
+    """Postures from which inverse kinematics starts, with the first joint at zero. `fitting.seeds_of` seeks missing ones."""
     R_BL: Array | None = None
     """Axes of the links at zero in the arm's base, shape (3, 3); None if they are those of the base."""
 

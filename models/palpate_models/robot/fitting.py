@@ -1,5 +1,6 @@
 """Fits of values that an arm's URDF and file leave open: a ready posture, and a capsule about each link."""
 
+from functools import cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,11 +27,16 @@ class HomeTuning(NamedTuple):
     """Minimum cosine between the flange's z axis and straight down at home."""
     weights: tuple[float, float] = (1.0, 10.0)
     """Weights of the flange's direction over its place, tried in order until a posture is found."""
+    seeds: int = 5
+    """Maximum number of postures from which inverse kinematics starts, home included."""
+    seed_rad: float = 0.3
+    """Least difference between them, in one joint."""
 
 
 HOME: Final = HomeTuning()
 
 
+@cache
 def ready_postures(arm: Arm) -> list[Array]:
     """Return joint positions [rad], shape (n,), with the flange straight down above the base's front, the best ones first."""
     rng = np.random.default_rng(0)
@@ -54,6 +60,16 @@ def ready_postures(arm: Arm) -> list[Array]:
     elbow = arm.elbow[0]
     order = sorted(upright, key=lambda one: (one.cost >= lowest + HOME.spread, -float(arm.posture(one.x)[0][elbow, 2])))
     return [np.round(one.x, 3) for one in order]
+
+
+@cache
+def seeds_of(arm: Arm) -> tuple[tuple[float, ...], ...]:
+    """Return the postures [rad] from which inverse kinematics starts: the arm's own, else home and ready ones that differ."""
+    kept: list[Array] = []
+    for q in () if arm.seeds_rad else (arm.home_rad, *ready_postures(arm)):
+        if all(np.abs(q - other).max() > HOME.seed_rad for other in kept):
+            kept.append(q)
+    return arm.seeds_rad or tuple(tuple(q.tolist()) for q in kept[: HOME.seeds])
 
 
 def enclosing_capsule(points: Array) -> Capsule:

@@ -40,9 +40,10 @@ class ArmTuning(NamedTuple):
     largest_link_m: float = 2.0
     """A larger mesh is in other units."""
     smallest_link_m: float = 0.005
-    seeds: int = 5
-    """Maximum number of postures from which inverse kinematics starts, home included."""
-    seed_rad: float = 0.3
+    smallest_mass_kg: float = 0.005
+    """A lighter link with a shape lacks its inertial: only what is fixed to it has some."""
+    largest_turn_rad: float = 20.0
+    """A limit beyond is in degrees: no arm turns that far."""
     mount_m: float = 0.01
     """A flange nearer to the last joint does not show where the arm points."""
     inertia_tolerance: float = 1e-3
@@ -65,10 +66,12 @@ def load_arm(name: str) -> Arm:
 def read_arm(name: str) -> tuple[Arm | None, list[str]]:
     """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
     given, path = arm_file(name), arm_path(name)
-    return _Reader(given, _resolve(given.urdf, path.parent)).read(path.stem)
+    if not (file := _resolve(given.urdf, path.parent)).is_file():
+        raise UserError(f"{path}: urdf: {file}: no such file")
+    return _Reader(given, file).read(path.stem)
 
 
-def flange_advice(arm: Arm, given: ArmFile, file: str = "the YAML file") -> str:
+def _flange_fault(arm: Arm, given: ArmFile) -> str:
     """Return which turn of the flange to write if its z does not point out of the arm; empty if it does, or cannot be seen."""
     p, R = arm.flange_m, Rotation.from_euler("xyz", given.flange_rpy_rad)
     axis = int(np.argmax(np.abs(p)))
@@ -78,14 +81,23 @@ def flange_advice(arm: Arm, given: ArmFile, file: str = "the YAML file") -> str:
     turn = Rotation.from_rotvec((np.pi, 0, 0) if axis == 2 else np.cross((0, 0, np.pi / 2), out))
     with warnings.catch_warnings(action="ignore"):  # a gimbal lock, where the angles are still right
         rpy = np.round((R * turn).as_euler("xyz"), 4) + 0.0
-    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in {file}"
+    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in the YAML file"
 
 
-def home_advice(arm: Arm, given: ArmFile, file: str = "the YAML file") -> str:
-    """Return which field to write with which value, where an arm's home posture is missing or unusable."""
-    angles = ", ".join(arm.joint_names)
-    other = f"write `home_rad: [...]` in {file}: [rad] of {angles} with the tool straight down, clear of the arm"
-    return flange_advice(arm, given, file) or other
+def home_advice(arm: Arm) -> str:
+    """Return what to write where an arm's home posture is missing or unusable."""
+    return f"write home_rad in the YAML file, [rad] of {', '.join(arm.joint_names)}: the tool straight down, clear of the arm"
+
+
+def _at_home(arm: Arm, given: ArmFile) -> tuple[Arm | None, list[str]]:
+    """Return the arm with a home posture, None without one or for a wrong flange, and what is wrong."""
+    if fault := _flange_fault(arm, given):
+        return None, [fault]
+    if given.home_rad is None:
+        if not (found := ready_postures(arm)):
+            return None, [f"home_rad: no posture with z of {given.flange} straight down was found: {home_advice(arm)}"]
+        arm = replace(arm, home_rad=found[0])
+    return arm, []
 
 
 def _resolve(name: str, folder: Path) -> Path:
@@ -110,7 +122,6 @@ def _coal() -> Any:
 
 Group = list[tuple[str, Array]]
 """Links fixed to each other, with their pose in the root at zero."""
-_PART: Final = "where the arm is part of a larger robot, write `base: LINK` in the YAML file, the link where it begins"
 _MOMENTS: Final = ("xx", "yy", "zz", "xy", "xz", "yz")
 _LIMITS: Final[tuple[tuple[str, str, float | None], ...]] = (
     ("lower", "lower_rad", -TUNING.continuous_rad),
@@ -119,6 +130,7 @@ _LIMITS: Final[tuple[tuple[str, str, float | None], ...]] = (
     ("effort", "torque_nm", None),
 )
 """Limits of a joint: attribute in a URDF, field of `ArmFile`, value for a continuous joint."""
+_NOT_PER_JOINT: Final = ("flange_rpy_rad", "base_xy_m", "seeds_rad")
 
 
 class _Reader(UrdfTree):
@@ -127,6 +139,8 @@ class _Reader(UrdfTree):
     def __init__(self, given: ArmFile, path: Path) -> None:
         super().__init__(path)
         self._given, self._path = given, path
+        part = "; where the arm is part of a larger robot, write `base: LINK` in the YAML file, the link where it begins"
+        self._wanted = "expected 6 or 7 joints that turn" + ("" if given.base else part)
 
     def read(self, name: str) -> tuple[Arm | None, list[str]]:
         """Return the arm, None if it is unusable, and the faults."""
@@ -138,36 +152,38 @@ class _Reader(UrdfTree):
             return None, [*self.faults, f"{self._path.name}: {error}"]
 
     def _arm(self, name: str) -> tuple[Arm | None, list[str]]:
-        if self._given.flange not in self.links:
-            near = get_close_matches(self._given.flange, self.links, 6, 0.4) or list(self.links)[-6:]
-            return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
-        chain = self.chain(self._given.flange)
-        if self._given.base is not None:
-            if self._given.base not in chain[:-1]:
-                between = f"it has {', '.join(chain[:-1])}"
-                return None, [f"base: no link {self._given.base!r} before {self._given.flange}; {between}"]
-            chain = chain[chain.index(self._given.base) :]
+        given = self._given
+        if given.flange not in self.links:
+            near = get_close_matches(given.flange, self.links, 6, 0.4) or list(self.links)[-6:]
+            return None, [f"flange: no link {given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
+        chain = self.chain(given.flange)
+        if given.base is not None:
+            if given.base not in chain[:-1]:
+                return None, [f"base: no link {given.base!r} before {given.flange}; it has {', '.join(chain[:-1])}"]
+            chain = chain[chain.index(given.base) :]
         self._base = chain[0]
         poses, moving = self._link_poses(chain)
         n = len(moving)
         if n not in (6, 7):
-            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, expected 6 or 7 that turn; {_PART}"]
+            return None, [f"{n} joints from {chain[0]} to {given.flange}; {self._wanted}"]
+        lists = [(field, values) for field, values in given if field not in _NOT_PER_JOINT and isinstance(values, tuple)]
+        lists += [("seeds_rad", q) for q in given.seeds_rad]
+        if wrong := [f"{field}: expected {n} values, one per joint, not {len(q)}" for field, q in lists if len(q) != n]:
+            return None, [*self.faults, *wrong]
         lower, upper, velocity, torque = self._limits(moving)
-        R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
+        R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
         frames = [np.eye(4), *(poses[chain.index(link_name(joint, "child"))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
         inertias = tuple(self._inertia(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
         capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
         if not any(capsules):
-            self.faults.append(f"links {chain[0]} to {self._given.flange}: none has a shape, so collisions cannot be seen")
-        home = np.zeros(n) if self._given.home_rad is None else np.array(self._given.home_rad)
-        if len(home) != n:
-            self.faults.append(f"home_rad: {len(home)} values, expected {n}")
+            self.faults.append(f"links {chain[0]} to {given.flange}: none has a shape, so collisions cannot be seen")
+        home = np.zeros(n) if given.home_rad is None else np.array(given.home_rad)
         if self.faults:
             return None, self.faults
         axes = np.array([X[:3, :3] @ self._axis(joint) for X, joint in zip(frames[1:], moving, strict=True)])
-        given, last = self._given, link_name(moving[-1], "child")
+        last = link_name(moving[-1], "child")
         for k in np.flatnonzero((home < lower) | (home > upper)) if given.home_rad else ():
             joint = moving[k].get("name")
             self.faults.append(f"home_rad: {home[k]:.3f} of {joint} is outside {lower[k]:.3f} to {upper[k]:.3f} rad")
@@ -192,15 +208,7 @@ class _Reader(UrdfTree):
             seeds_rad=given.seeds_rad,
             R_BL=R_BF,
         )
-        if not self.faults and not (given.home_rad and given.seeds_rad):
-            found = ready_postures(arm)
-            if given.home_rad is None and found:
-                arm = replace(arm, home_rad=found[0])
-            elif given.home_rad is None:
-                text = f"no posture with z of {given.flange} straight down was found"
-                self.faults.append(f"home_rad: {text}: {home_advice(arm, given)}")
-            arm = arm if given.seeds_rad else replace(arm, seeds_rad=_distinct([arm.home_rad, *found]))
-        return (None if self.faults else arm), self.faults
+        return (None, self.faults) if self.faults else _at_home(arm, given)
 
     def _axis(self, joint: ElementTree.Element) -> Array:
         """Return the unit axis of a joint."""
@@ -226,7 +234,7 @@ class _Reader(UrdfTree):
             if kind in ("revolute", "continuous"):
                 moving.append(joint)
             elif kind != "fixed":
-                raise ValueError(f"{self.part}: is {kind}; expected joints that turn; {_PART}")
+                raise ValueError(f"{self.part}: is {kind}, between {chain[0]} and {self._given.flange}; {self._wanted}")
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> Array:
@@ -236,18 +244,19 @@ class _Reader(UrdfTree):
             limit, name = joint.find("limit"), joint.get("name")
             self.part = f"joint {name}"
             for row, (attribute, field, endless) in enumerate(_LIMITS):
-                given = getattr(self._given, field)
-                if given is not None and k < len(given):
+                if (given := getattr(self._given, field)) is not None:
                     table[row, k] = given[k]
                 elif endless is not None and joint.get("type") == "continuous":
                     table[row, k] = endless
                 elif limit is None or attribute not in limit.attrib:
-                    self.faults.append(f"joint {name}: no limit {attribute!r}; give {field} in the YAML file")
+                    self.faults.append(f"{self.part}: no limit {attribute!r}; give {field} in the YAML file, a value per joint")
                 else:
                     table[row, k] = self.numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
             if upper - lower <= (least := 2 * Limits().joint_margin_rad):
                 self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad, expected more than {least:g} rad")
+            if max(abs(lower), abs(upper)) > TUNING.largest_turn_rad:
+                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad: its unit is not radians")
             for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
                 if value <= 0:
                     self.faults.append(f"joint {name}: {field} is {value:g}, expected more than 0")
@@ -300,9 +309,9 @@ class _Reader(UrdfTree):
             parts.append((mass, X_C[:3, 3], X_C[:3, :3] @ tensor @ X_C[:3, :3].T))
         name, total = group[0][0], sum(mass for mass, _, _ in parts)
         fixed = name == self._base
+        if 0 <= total < TUNING.smallest_mass_kg and not fixed and (total or not parts):
+            self.faults.append(f"link {name}: no mass: {total:.2g} kg with all that is fixed to it; expected an inertial")
         if total <= 0:
-            if not (fixed or parts):
-                self.faults.append(f"link {name}: no mass")
             return Inertia(1.0, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))  # the base does not move
         centre = sum(mass * p for mass, p, _ in parts) / total
         about = sum(tensor + mass * ((r := p - centre) @ r * np.eye(3) - np.outer(r, r)) for mass, p, tensor in parts)  # Steiner
@@ -380,17 +389,9 @@ class _Reader(UrdfTree):
             return np.zeros((0, 3))
         size = float(np.ptp(hull, axis=0).max())
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
-            self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; give a scale in the URDF")
+            change = f"change its scale, {mesh.get('scale')}," if "scale" in mesh.attrib else "give a scale"
+            self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; {change} in the URDF")
         return np.asarray(hull)
-
-
-def _distinct(postures: list[Array]) -> tuple[tuple[float, ...], ...]:
-    """Return the first postures [rad] that differ from each other by more than `TUNING.seed_rad` in a joint."""
-    kept: list[Array] = []
-    for q in postures:
-        if all(np.abs(q - other).max() > TUNING.seed_rad for other in kept):
-            kept.append(q)
-    return tuple(tuple(q.tolist()) for q in kept[: TUNING.seeds])
 
 
 def _or(given: tuple[float, ...] | None, usual: Array) -> Array:

@@ -52,7 +52,8 @@ class UrdfTree:
                 if link not in self.links:
                     found.append(f"joint {joint.get('name')}: no link {link!r} in the file, its {end}")
             if self.joint_of[link_name(joint, "child")] is not joint:
-                found.append(f"link {link_name(joint, 'child')}: has two joints above it, one is {joint.get('name')}")
+                both = f"{joint.get('name')} and {self.joint_of[link_name(joint, 'child')].get('name')}"
+                found.append(f"link {link_name(joint, 'child')}: has two joints above it, {both}")
         roots = [link for link in self.links if link not in self.joint_of]
         if len(roots) > 1 and not found:
             found.append(f"links {', '.join(roots)}: {len(roots)} roots, expected one")

@@ -8,14 +8,14 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from palpate_errors import UserError
-from palpate_models.section import NonNegative, Section, Vec2, Vec3, read_model
+from palpate_models.section import NonNegative, Section, Turn, Vec2, Vec3, read_model
 
 FOLDER: Final = Path(__file__).with_name("arms")
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
 
 DEFAULT_ARM: Final = "lbr"
 """The arm whose tables are built in."""
-Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
+Joints = tuple[float, ...]
 """One value a joint, from the base to the flange."""
 
 
@@ -48,7 +48,7 @@ class ArmFile(Section):
     base_xy_m: Vec2 = (0.0, 0.0)
     """Position of the base in world; `palpate arm place` finds it."""
     base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
-    base_yaw_rad: float = 0.0
+    base_yaw_rad: Turn = 0.0
     joint_friction_nm: NonNegative = 0.1
     """Coulomb friction."""
     joint_damping_nms: NonNegative = 1.0

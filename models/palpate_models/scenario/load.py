@@ -17,28 +17,14 @@ from palpate_inputs import brief, parse_yaml, read_text
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import ExamInput, PlantInput, Scenario
-from palpate_models.section import UNITS, Pose, did_you_mean, unknown_field
+from palpate_models.section import Pose, did_you_mean, explain_error
 
 
 def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel], error: ValidationError) -> str:
     """Return a line per invalid value of the scenario `name`, given as YAML in `text` and changed by `a.b=c` settings."""
     lines = []
     for item in error.errors()[:_EXPLAINED]:
-        field = [str(part) for part in item["loc"]]
-        what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "expected ")
-        if item["type"] == "extra_forbidden":
-            what = unknown_field(field[-1], model)
-        elif item["type"] in _NO_SECTION:
-            what = "expected a section, a mapping of fields"
-        elif item["type"] == "missing":
-            last = field.pop()
-            what = f"expected at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
-        elif item["type"] == "tuple_type":
-            what = "expected a list of values in square brackets"
-        elif item["type"] == "too_long":
-            what = f"expected at most {item['ctx']['max_length']} values"
-        elif item["type"] in _NUMBERS and (unit := _unit(field)):
-            what += f" (in {unit})"
+        field, what = explain_error(item, model)
         path = ".".join(field) or "scenario"
         lines.append(f"{_origin(name, text, settings, field)}: {path} = {brief(item['input'])}: {what}")
     return "\n".join(lines)
@@ -46,18 +32,6 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
 
 _EXPLAINED = 20
 """Invalid values that a message lists."""
-_NO_SECTION = frozenset(("model_type", "model_attributes_type", "dict_type"))
-"""pydantic's error types for a value in place of a section."""
-
-
-_NUMBERS = frozenset(("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_parsing", "float_type"))
-"""pydantic's error types for a number out of bounds and for a value that is not a number."""
-
-
-def _unit(field: Sequence[str]) -> str | None:
-    """Return the unit at the end of a field's name: metres for `exam.region_m.0`."""
-    name = next((part for part in reversed(field) if not part.isdigit()), "")
-    return UNITS.get(name.rpartition("_")[2]) if "_" in name else None
 
 
 def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Phantom
 from palpate_models.scenario.arm_file import DEFAULT_ARM, CommandLevel, placement_of
 from palpate_models.scenario.errors import Errors
-from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
+from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Turn, Vec2, Vec3
 from palpate_plugins import PluginKind, is_file
 
 SEARCH: Final = "search"
@@ -184,7 +184,7 @@ class Robot(Section):
     """Height of the base. The three defaults of its placement are the optimum of `palpate arm place`."""
     base_xy_m: Vec2 = (0.03, 0.02)
     """Position of the base in world."""
-    base_yaw_rad: float = 0.0
+    base_yaw_rad: Turn = 0.0
     """Rotation of the base about the vertical."""
     joint_friction_nm: NonNegative = 0.1
     """Nominal Coulomb friction (lbr_fri_ros2_stack's URDF)."""

@@ -63,7 +63,7 @@ def quadric(p_A: Array, xy: Array) -> Array:
 
 
 HINTS: Final = {
-    ViewReason.VIEW_BLOCKED: "view blocked by an object, probably the arm, up to {:.2f} m in front of the surface",
+    ViewReason.VIEW_BLOCKED: "view blocked by an object, probably the arm (its home_rad), up to {:.2f} m in front of the surface",
     ViewReason.SELF_OCCLUDED: "hidden behind the abdomen itself: place the camera higher",
     ViewReason.OUT_OF_IMAGE: "outside the image: turn the camera towards the region",
     ViewReason.NO_DEPTH: "no depth: seen at too grazing an angle or out of range",

@@ -110,7 +110,8 @@ def test_joint_margin_is_kept() -> None:
 
 
 def test_default_base_serves_the_default_scan() -> None:
-    from palpate.arm.placement import PLACEMENT, scan_targets
+    from palpate.arm.placement import PLACEMENT
+    from palpate.run.clearance import scan_targets
 
     scenario = Scenario()
     for raised in (0.0, PLACEMENT.raised_m):

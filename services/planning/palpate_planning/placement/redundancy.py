@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.robot.arm import arm_of
+from palpate_models.robot.fitting import seeds_of
 from palpate_models.scenario.schema import Robot
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
@@ -190,12 +191,12 @@ def _at_origin(robot: Robot) -> Robot:
 
 
 def _seeds(batch: Batch, seed: Array) -> list[Array]:
-    """Return initial postures: the caller's, and the arm's, home if it has none, turned about its first joint to the targets."""
+    """Return initial postures: the caller's, and the arm's, turned about its first joint to the targets."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
     seeds = [seed]
-    for q in np.array(batch.arm.seeds_rad or (batch.arm.home_rad,)):
+    for q in np.array(seeds_of(batch.arm)):
         q[0] = 0.0
         x, y, _ = batch.arm.posture(q)[0][-1]
         q[0] = azimuth - np.arctan2(y, x)

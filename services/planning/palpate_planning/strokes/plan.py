@@ -146,11 +146,11 @@ class ExamPlanner:
         return chosen.q, skipped
 
 
-def look_postures(known: ExamInput) -> list[Array]:
+def look_postures(known: ExamInput, *, hidden: bool = True) -> list[Array]:
     """Return collision-free postures to look from [rad], shape (n,) each: those that leave the view free first, by their turn.
 
     They are the home posture, and it turned by the first joint within its limits: the arm cannot follow a set-point beyond
-    them, and jumps once the motion from there comes back within them.
+    them, and jumps once the motion from there comes back within them. `hidden`: also those that may hide the view.
     """
     kinematics = ArmKinematics(known.robot, known.limits)
     size = (known.exam.region_m[0] + 2 * SCAN.view_margin_m, known.exam.region_m[1] + 2 * SCAN.view_margin_m)
@@ -162,6 +162,6 @@ def look_postures(known: ExamInput) -> list[Array]:
         q = kinematics.arm.home_rad.copy()
         q[0] += turn
         within = not turn or kinematics.lower[0] <= q[0] <= kinematics.upper[0]
-        if within and scene.free(q):
+        if within and scene.free(q) and (hidden or view.clear(q)):
             postures.append(q)
     return sorted(postures, key=lambda q: not view.clear(q))
