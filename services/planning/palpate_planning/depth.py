@@ -5,7 +5,7 @@ at rest. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F 
 
     F_ff = a LP(F)                          feed-forward of the measured force, a < 1: positive feedback of gain below one
     d_c  = d_r + k_i integral(d_r - d) - g  a slow integral for what is left: friction, model error
-    d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45)
+    d_r  -> min(target, d (F_max/F_p)^(1/n))   the depth at which the force would be F_max, if F ~ d^n
     g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard wall, a wrong exponent
 
 with F the normal force, L the magnitude of the whole force (a hard edge pushes laterally, too), and F_p = L + tau dL/dt the
@@ -18,8 +18,9 @@ from typing import Final, NamedTuple
 class DepthTuning(NamedTuple):
     """Constants of the law above."""
 
-    exponent: float = 1.45
-    """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
+    exponent: float = 4.0
+    """n: steeper than tissue (1.2 to 3), whose damping makes it steeper still for fast motion. With a flatter one the force
+    swings about its limit at 5 to 10 Hz; a steeper one only approaches the limit later."""
     force_fraction: float = 0.83
     """Fraction of the working force limit at which depth yields: force rises until the arm has yielded."""
     feed_forward: float = 0.9
@@ -28,8 +29,8 @@ class DepthTuning(NamedTuple):
     """Low-pass of the measured force."""
     rate_lag_s: float = 0.03
     """Low-pass of its derivative."""
-    lead_s: float = 0.08
-    """tau: delay of the command (20 ms) and rise of the impedance (about 60 ms)."""
+    lead_s: float = 0.04
+    """tau: delay of the command (20 ms) and of the arm that follows it."""
     integral_per_s: float = 4.0
     """k_i: well below the impedance's bandwidth of about 5 Hz."""
     integral_max_m: float = 0.004

@@ -70,13 +70,14 @@ def hertz(newton: float) -> Callable[[float], float]:
     return lambda depth: newton * (max(depth, 0.0) / 0.01) ** 1.45
 
 
-def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: int = 0) -> np.ndarray:
-    """Rows of time, reference, depth, force, limited of an indentation at 20 mm/s from 10 mm above to 10 mm depth.
+def indent(force: Callable[[float, float], float], follow_s: float | None = None) -> np.ndarray:
+    """Rows of time, reference, depth, force, limited of an indentation at 20 mm/s from 10 mm above to 10 mm depth, for 4 s.
 
-    The arm: 4 kg, K_z, damping ratio 0.8, 1 N of friction; `force` by depth and time; sensor noise; the command comes
-    into force 10 ms late and is extrapolated by its rate.
+    The arm: 4 kg, K_z, damping ratio 0.8, 1 N of friction; or one that takes positions, follows them with the time constant
+    `follow_s` and yields by admittance. `force` by depth and time; sensor noise; the command comes into force 10 ms late and is
+    extrapolated by its rate.
     """
-    rng = np.random.default_rng(seed)
+    rng, yielded = np.random.default_rng(0), 0.0
     mass, damping, dt = 4.0, 2 * 0.8 * np.sqrt(NORMAL_STIFFNESS * 4.0), 1e-3
     regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
     regulator.reset(-0.01)
@@ -84,7 +85,7 @@ def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: i
     latest: tuple[Regulation, float] | None = None
     pending: tuple[Regulation, float] | None = None
     depths, forces, rows = [], [], []
-    for k in range(round(seconds / dt)):
+    for k in range(4000):
         t = k * dt
         F = force(x + DASHPOT_S * v if x > 0 else x, t)
         depths.append(x)
@@ -109,8 +110,12 @@ def indent(force: Callable[[float, float], float], seconds: float = 4.0, seed: i
                 regulation.rate,
                 regulation.feed_forward_n,
             )
-        pull = NORMAL_STIFFNESS * (goal - x) + damping * (rate - v) + feed - F - np.tanh(v / 0.002)
-        v += pull / mass * dt
+        if follow_s is None:
+            pull = NORMAL_STIFFNESS * (goal - x) + damping * (rate - v) + feed - F - np.tanh(v / 0.002)
+            v += pull / mass * dt
+        else:
+            yielded += dt / 0.15 * ((F - feed) / NORMAL_STIFFNESS - yielded)
+            v = (goal - yielded - x) / follow_s
         x += v * dt
     return np.array(rows, dtype=float)
 
@@ -148,6 +153,14 @@ def test_a_wrong_exponent_still_ends_at_the_limit(exponent: float) -> None:
     assert rows[-1, 3] > 0.6 * DEPTH.force_fraction * LIMIT_N
 
 
+@pytest.mark.parametrize("follow_s", [None, 0.04])
+@pytest.mark.parametrize("exponent", [1.45, 2.4, 3.0])
+def test_a_force_near_its_limit_does_not_swing(exponent: float, follow_s: float | None) -> None:
+    rows = indent(lambda depth, t: 16.0 * (max(depth, 0.0) / 0.01) ** exponent, follow_s)
+    assert rows[:, 3].max() < 13.5
+    assert np.ptp(rows[-200:, 3]) < 0.5
+
+
 def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> None:
     rows = indent(lambda depth, t: 1e5 * max(depth, 0.0))
     assert rows[:, 3].max() < 25.0
@@ -160,7 +173,7 @@ def test_lateral_force_reduces_depth_like_normal_force() -> None:
     for _ in range(100):
         regulation = regulator.update(target_m=0.01, depth_m=0.01, normal_force_n=11.0, load_n=16.0, in_contact=True)
     assert regulation.limited
-    assert regulation.reference_m < 0.0085
+    assert regulation.reference_m < 0.0095
     assert regulation.feed_forward_n == pytest.approx(DEPTH.feed_forward * 11.0)
 
 
