@@ -19,7 +19,7 @@ TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "
 TENSOR = '<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><origin xyz="0 0 0.05"/><mass value="{{m}}"/>{TENSOR}</inertial>'
 XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>'
-FIELDS = ("flange", "home_rad", "urdf", "base", "base_heigth_m", "base_yaw_rad", "seeds_rad", "lower_rad")
+FIELDS = ("flange", "flange_rpy_rad", "home_rad", "urdf", "base", "base_heigth_m", "base_yaw_rad", "seeds_rad", "lower_rad")
 GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 
 
@@ -242,6 +242,11 @@ def test_a_link_without_a_shape_is_not_drawn(tmp_path: Path) -> None:
     meshes = visual_meshes(Robot(arm=write(tmp_path, collision="")))
     assert "link_3" not in meshes
     assert all(meshes.values())
+
+
+def test_a_flange_that_stands_aside_is_right_if_the_file_says_so(tmp_path: Path) -> None:
+    aside = ('rpy="0 0.4 0"', 'rpy="0 1.6 0"')
+    assert not any("z of tip" in fault for fault in read_arm(write(tmp_path, swap=aside, flange_rpy_rad=[0.0, 0.0, 0.0]))[1])
 
 
 def test_inverse_kinematics_starts_from_several_postures(tmp_path: Path) -> None:

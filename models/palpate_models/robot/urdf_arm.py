@@ -72,16 +72,21 @@ def read_arm(name: str) -> tuple[Arm | None, list[str]]:
 
 
 def _flange_fault(arm: Arm, given: ArmFile) -> str:
-    """Return which turn of the flange to write if its z does not point out of the arm; empty if it does, or cannot be seen."""
+    """Return which turn of the flange to write if its z does not point out of the arm.
+
+    Empty if it does, cannot be seen, or the file says that it needs no turn: it may stand aside of the last joint.
+    """
     p, R = arm.flange_m, Rotation.from_euler("xyz", given.flange_rpy_rad)
     axis = int(np.argmax(np.abs(p)))
-    if np.linalg.norm(p) < TUNING.mount_m or (axis, p[axis] > 0) == (2, True):
+    said = "flange_rpy_rad" in given.model_fields_set and not any(given.flange_rpy_rad)
+    if said or np.linalg.norm(p) < TUNING.mount_m or (axis, p[axis] > 0) == (2, True):
         return ""
     out = np.sign(p[axis]) * np.eye(3)[axis]
     turn = Rotation.from_rotvec((np.pi, 0, 0) if axis == 2 else np.cross((0, 0, np.pi / 2), out))
     with warnings.catch_warnings(action="ignore"):  # a gimbal lock, where the angles are still right
         rpy = np.round((R * turn).as_euler("xyz"), 4) + 0.0
-    return f"z of {given.flange} does not point out of the arm: write `flange_rpy_rad: {rpy.tolist()}` in the YAML file"
+    change = f"write `flange_rpy_rad: {rpy.tolist()}` in the YAML file, or `[0, 0, 0]` if it does"
+    return f"z of {given.flange} does not point out of the arm: {change}"
 
 
 def home_advice(arm: Arm) -> str:
