@@ -61,4 +61,4 @@ MOVED: Final = Cause(Reason.PATIENT_MOVED, "the patient has moved")
 def count_causes(causes: Iterable[Cause]) -> str:
     """Return how many targets have each cause, as text."""
     counts = Counter(cause.text for cause in causes)
-    return "; ".join(f"{count} targets skipped: {text}" for text, count in sorted(counts.items()))
+    return "; ".join(f"{count} target{'s' * (count > 1)} skipped: {text}" for text, count in sorted(counts.items()))
