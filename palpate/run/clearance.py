@@ -1,4 +1,4 @@
-"""What an arm touches where it stands, and what to write in its YAML file against it."""
+"""Shapes that an arm touches where it stands, and advice for its YAML file against it."""
 
 from functools import cache
 

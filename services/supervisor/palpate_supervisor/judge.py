@@ -33,7 +33,7 @@ class JudgeTuning(NamedTuple):
     gain_sd: float = 0.08
     """Standard deviation of the gain of poor sensors, weighed by a tool whose mass is not known exactly."""
     wander_n: float = 0.33
-    """What the bias wanders while the load changes: by that over the root of the information, the gain has another error."""
+    """Wandering of the bias while the load changes; its error of the gain falls with the root of the information."""
     excitation_n2: float = 5.0
     """Minimum information on the gain for the self-test."""
     noise_n: float = 1.5
