@@ -10,6 +10,7 @@ from typing import Any
 from palpate_bus import messages
 
 ENUMERATIONS: dict[str, tuple[str, str]] = {
+    "DriverMode": ("RobotStatus", "MODE_"),
     "FindingKind": ("Finding", "KIND_"),
     "HoldCause": ("RobotStatus", "CAUSE_"),
     "Phase": ("ExamState", "PHASE_"),

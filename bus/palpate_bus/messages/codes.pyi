@@ -2,6 +2,11 @@
 
 from enum import IntEnum
 
+class DriverMode(IntEnum):
+    IDLE = 0
+    ACTIVE = 1
+    SAFE_HOLD = 2
+
 class FindingKind(IntEnum):
     LUMP = 0
     MUSCLE = 1

@@ -2,15 +2,15 @@
 
 A driver is IDLE until its first valid command, then ACTIVE. On an expired or invalid command, a lost commander, a violated limit
 or a stop request it enters SAFE_HOLD and stays there until released. IDLE and SAFE_HOLD compensate gravity and damp the joints,
-without
-stiffness: pressed tissue pushes the arm away, so the force falls. An arm that takes positions stops and stays where it is.
+without stiffness: pressed tissue pushes the arm away, so the force falls. An arm that takes positions stops and stays where it
+is.
 """
 
-from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
@@ -41,30 +41,6 @@ class DriverTuning(NamedTuple):
 
 TUNING: Final = DriverTuning()
 _COMMAND: Final = "control/joint_torque"
-
-
-class DriverMode(IntEnum):
-    """Values of `palpation_msgs/RobotStatus.mode`."""
-
-    IDLE = 0
-    ACTIVE = 1
-    SAFE_HOLD = 2
-
-
-class HoldCause(IntEnum):
-    """Values of `palpation_msgs/RobotStatus.cause`."""
-
-    NONE = 0
-    COMMAND_EXPIRED = 1
-    COMMANDER_LOST = 2
-    POSITION_LIMIT = 3
-    VELOCITY_LIMIT = 4
-    TORQUE_LIMIT = 5
-    INVALID_COMMAND = 6
-    FORCE_LIMIT = 7
-    STOP_REQUESTED = 8
-    DEVICE = 9
-    """The arm, its controller, its sensor or the connection to them."""
 
 
 class Command(NamedTuple):

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import NS, Header, JointState, Message, RobotStatus, String, Time, Vector3, Wrench, WrenchStamped
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
@@ -15,7 +16,7 @@ from palpate_models.robot.arm import arm_of, link_names, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
-from palpate_robot.driver import Driver, DriverMode, HoldCause
+from palpate_robot.driver import Driver
 from palpate_robot.plant import DT, PlantFactory
 from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors

@@ -5,8 +5,9 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.messages import Message, OperatorRequest, SupervisorState, nanoseconds
+from palpate_bus.messages.codes import HoldCause
 from palpate_bus.service import Inbox
-from palpate_robot.driver import Command, Driver, HoldCause
+from palpate_robot.driver import Command, Driver
 
 REQUESTS: Final = (OperatorRequest.STOP, OperatorRequest.RELEASE, OperatorRequest.END, OperatorRequest.SOFT_STOP)
 

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.mujoco.plant import MujocoPlant
-from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
+from palpate_robot.driver import Command, Driver
 from palpate_robot.plant import DT
 from palpate_robot.position_loop import TUNING, PositionLoop
 

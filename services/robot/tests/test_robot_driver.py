@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import message_type
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.robot import lbr
 from palpate_models.robot.lbr import ARM
-from palpate_robot.driver import TUNING, Command, Driver, DriverMode, HoldCause
+from palpate_robot.driver import TUNING, Command, Driver
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -30,14 +30,6 @@ def active() -> Driver:
     _update(driver, MS, _command(0))
     assert driver.mode is DriverMode.ACTIVE
     return driver
-
-
-def test_numbers_are_those_of_the_message() -> None:
-    status = message_type("palpation_msgs/msg/RobotStatus")
-    for mode in DriverMode:
-        assert getattr(status, f"MODE_{mode.name}") == mode
-    for cause in HoldCause:
-        assert getattr(status, f"CAUSE_{cause.name}") == cause
 
 
 def test_validity_is_that_of_the_contract() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_message, header
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
 from palpate_models.robot.urdf_arm import load_arm
@@ -13,7 +14,6 @@ from palpate_models.scenario.load import load_scenario
 from palpate_robot.backends.ros2_control.checks import FirstContactCheck
 from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules
 from palpate_robot.backends.ros2_control.service import create
-from palpate_robot.driver import DriverMode, HoldCause
 
 MS = 1_000_000
 WALL_NPM = 2000.0

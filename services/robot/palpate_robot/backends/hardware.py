@@ -16,6 +16,7 @@ import pinocchio as pin
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, Message, RobotStatus, String, WrenchStamped, header
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.messages.geometry import wrench, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
@@ -23,7 +24,7 @@ from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_robot.backends.arm_port import ArmPort
-from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
+from palpate_robot.driver import Command, Driver
 from palpate_robot.stop_requests import ReceivedCommands, StopRequests
 
 JOINTS: Final = "joint_states"

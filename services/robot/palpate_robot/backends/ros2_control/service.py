@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from palpate_bus.messages.codes import HoldCause
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import BusConfigError, Settings
@@ -22,7 +23,6 @@ from palpate_robot.backends.ros2_control.checks import TUNING, FirstContactCheck
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
 from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port, tool_load
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
-from palpate_robot.driver import HoldCause
 
 DAMPING_SHARE: Final = 0.1
 """Maximum joint damping in a hold over that of the simulated driver (assumed): it acts one to three cycles late."""
