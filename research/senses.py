@@ -39,7 +39,6 @@ PRESSED_N: Final = 3.0
 TOPICS: Final = contract().topics
 SETTINGS: Final = ("exam.region_m=[0.06,0.06]", "exam.spacing_m=0.02", "camera.frames=10")
 COLUMNS: Final = ("seed", "length_s", "ended", "stops", "false_alarms", *ForceComparison._fields)
-CLEAR_M: Final = SUPERVISOR.clear_m
 WITHIN_S: Final = 10.0
 """Time in which a lie has to be seen."""
 
@@ -84,7 +83,7 @@ def judged(
     sense, judge = ToolSense(robot), SensorJudge()
     for i, (_, measured, depth) in enumerate(run):
         reading = measured if lie is None else measured._replace(wrench_S=lie(i, measured.wrench_S))
-        sense.sense(reading, PERIOD_S, clear=depth is not None and depth < -CLEAR_M)
+        sense.sense(reading, PERIOD_S, clear=depth is not None and depth < -SUPERVISOR.clear_m)
         found = judge.judge(sense.comparison, depth)
         yield sense.comparison, found[0].culprit if found else ""
 
