@@ -23,7 +23,7 @@ BACKGROUND_NICENESS = 3
 The loop waits for them, so with a higher value a run starves next to other work. Toy services, 2 s of simulated time on two
 loaded cores next to two busy processes, interleaved: with 15 no end within 100 s, and a lost message; with 3 in 6.5 and 11.5 s.
 """
-_NICENESS_BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
+_NICENESS_BY_PERIOD = ((100 * MS, 10), (10 * MS, 1))
 STOPPED: Final = frozenset({psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP})
 ENDED: Final = frozenset({psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD})
 

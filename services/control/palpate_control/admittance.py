@@ -16,7 +16,6 @@ The joints follow the planned posture, corrected by inverse kinematics on comman
 a singular wrist the tool tilts, where two joints would otherwise turn fast against each other and leave the plan.
 """
 
-from math import exp
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ from palpate_bus.setpoint import ControlMode
 from palpate_control.model import ArmModel
 from palpate_control.reference import Reference
 from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.robot.chain import Arm
 
 
 class AdmittanceTuning(NamedTuple):
@@ -47,6 +47,10 @@ class AdmittanceTuning(NamedTuple):
     """Damping of the least squares: a motion that moves the tool by less per rad follows the posture instead of the pose."""
     damping_rad: float = 0.3
     """Damping for turns of the tool [1]: near a singularity it tilts by a few degrees, and its place stays."""
+    pause_s: float = 0.02
+    """Maximum time for which one command integrates: 1 / `follow_per_s`."""
+    acceleration_factor: float = 1.0
+    """Maximum commanded acceleration over that of free motion: late set-points must not jerk the arm."""
     speed_share: float = 0.8
     """Maximum commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
 
@@ -57,16 +61,15 @@ TUNING = AdmittanceTuning()
 class AdmittanceController:
     """The law for one arm; it keeps the commanded joint positions."""
 
-    def __init__(
-        self, model: ArmModel, tool_mass_kg: float, limit_zone: float = 0.05, period_s: float = 1e-3, reading_s: float = 0.01
-    ) -> None:
-        """Create a controller called every `period_s`, with an F/T reading every `reading_s`.
+    def __init__(self, model: ArmModel, arm: Arm, tool_mass_kg: float, limit_zone: float = 0.05, reading_s: float = 0.01) -> None:
+        """Create a controller with an F/T reading every `reading_s`.
 
         It stays `limit_zone` [rad] away from joint limits where it starts there.
 
         `tool_mass_kg`: mass below the F/T sensor.
         """
-        self.model, self._dt, self._tare_share = model, period_s, min(reading_s / TUNING.tare_s, 1.0)
+        self._acceleration = arm.acceleration_radps2
+        self.model, self._tare_share = model, min(reading_s / TUNING.tare_s, 1.0)
         self._lower, self._upper = model.position_lower + limit_zone, model.position_upper - limit_zone
         self._weight_W = np.array((0.0, 0.0, -tool_mass_kg * GRAVITY))
         self._damping = np.diag(np.repeat((TUNING.damping_m, TUNING.damping_rad), 3) ** 2)
@@ -78,6 +81,8 @@ class AdmittanceController:
     def reset(self) -> None:
         """Start again from the measured position, as after a pause without commands."""
         self._q: Array | None = None
+        self._t: int | None = None
+        self._rate = np.zeros(self.model.joints)
         self._yield = np.zeros(3)
 
     def sense(self, force_S: Array, *, commanded: bool = True) -> None:
@@ -91,31 +96,37 @@ class AdmittanceController:
         """Return the joint positions to command [rad], shape (n,), at measured positions `q` [rad]; `qd` is not used."""
         if self._q is None:
             self._q = np.array(q, dtype=float)
+        dt = 0.0 if self._t is None else min(max(reference.t - self._t, 0) * 1e-9, TUNING.pause_s)
+        self._t = reference.t
         model, motion = self.model, reference.motion
         model.update_kinematics(self._q)
         if reference.setpoint.mode is ControlMode.JOINT:
             self._tare(model.R_WI)
-            rate = motion.qd + TUNING.follow_per_s * (motion.q - self._q)
+            error = motion.q - dt * motion.qd - self._q
+            braked = np.sqrt(2 * self._acceleration * np.abs(error))
+            rate = motion.qd + np.clip(TUNING.follow_per_s * error, -braked, braked)
         else:
-            rate = self._cartesian(reference)
+            rate = self._cartesian(reference, dt)
         rate = rate / max(1.0, float(np.max(np.abs(rate) / (TUNING.speed_share * model.velocity_limit))))
+        change = TUNING.acceleration_factor * self._acceleration * dt
+        self._rate = np.clip(rate, self._rate - change, self._rate + change)
         low, high = np.minimum(self._lower, self._q), np.maximum(self._upper, self._q)
-        self._q = np.clip(self._q + self._dt * rate, low, high)
+        self._q = np.clip(self._q + dt * self._rate, low, high)
         return self._q
 
-    def _cartesian(self, reference: Reference) -> Array:
-        """Return joint velocities [rad/s] that follow pose and posture, less what the force makes the tool yield."""
+    def _cartesian(self, reference: Reference, dt: float) -> Array:
+        """Return joint velocities [rad/s] that follow pose and posture, less what the force makes the tool yield in `dt` [s]."""
         assert self._q is not None
-        model, (setpoint, motion) = self.model, reference
+        model, setpoint, motion = self.model, reference.setpoint, reference.motion
         R_WD = motion.R_WD
         force_D = R_WD.T @ (self._force(model.R_WI) + motion.F_W[:3])
         K = setpoint.stiffness[:3]
         goal = np.clip(force_D / np.maximum(K, 1e-9), -TUNING.yield_max_m, TUNING.yield_max_m)
-        step = (1 - exp(-self._dt / TUNING.yield_s)) * (goal - self._yield)
-        self._yield = self._yield + step
+        yield_rate = (goal - self._yield) / TUNING.yield_s
+        self._yield = self._yield + dt * yield_rate
+        twist = motion.V_WD + np.concatenate((R_WD @ yield_rate, np.zeros(3)))
         error = np.concatenate((motion.p_WD + R_WD @ self._yield - model.p_WI, pin.log3(R_WD @ model.R_WI.T)))
-        twist = motion.V_WD + TUNING.follow_per_s * error
-        twist[:3] += R_WD @ step / self._dt
+        twist = twist + TUNING.follow_per_s * (error - dt * twist)
         back = TUNING.posture_per_s * (motion.q - self._q)
         posture = motion.qd + back / max(1.0, float(np.linalg.norm(back)) / TUNING.posture_radps)
         J = model.J_W

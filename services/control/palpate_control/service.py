@@ -41,7 +41,8 @@ class ControlService(Service):
 
     Before the first set-point it commands zero torque, so that the driver compensates gravity, or the measured positions.
     After a set-point has expired it sends commands with zero validity and the reason: the driver then enters its safe hold.
-    While joint states or F/T readings are stale it repeats the last command until that command's own expiry.
+    While joint states or F/T readings are stale it repeats the last torque until that command's own expiry; positions follow
+    the set-points until then, because an arm whose position is repeated stops at once.
 
     Set-points are applied in measurement time: a set-point stamped later than the newest measurement waits for it.
     """
@@ -53,12 +54,12 @@ class ControlService(Service):
         arm = arm_of(robot)
         self._names, self._home, self._still = list(arm.joint_names), arm.home_rad, np.zeros(self.model.joints)
         topics = contract().topics
-        zone, period_s = limits.joint_margin_rad, contract().roles[self.role].period / NS
+        zone = limits.joint_margin_rad
         self._robot, self._positions = robot, robot.level is CommandLevel.POSITION
         reading_s = topics["robot/status"].period / NS
-        law = AdmittanceController(self.model, robot.tool_mass_kg, zone, period_s, reading_s) if self._positions else None
+        law = AdmittanceController(self.model, arm, robot.tool_mass_kg, zone, reading_s) if self._positions else None
         self._admittance = law
-        self._controller = self._admittance or ImpedanceController(self.model, zone, period_s)
+        self._controller = self._admittance or ImpedanceController(self.model, zone, contract().roles[self.role].period / NS)
         self._reference = Extrapolator(topics[TOPIC].period)
         self._setpoint_expiry = topics[TOPIC].expiry
         self._joint_states_age = topics["joint_states"].max_age
@@ -99,8 +100,8 @@ class ControlService(Service):
             received = t
         measured = t if joints is None else min(nanoseconds(joints.header.stamp), received, t)
         # The reference is evaluated at the time of the measurement. With the present reference a late state would look like an
-        # error that grows with the speed and load the spring: 17 mrad after 20 ms at 0.86 rad/s.
-        followed = max(measured, t - self._setpoint_expiry)
+        # error that grows with the speed and load the spring: 17 mrad after 20 ms at 0.86 rad/s. Positions have no spring.
+        followed = t if self._positions else max(measured, t - self._setpoint_expiry)
         for message in inbox.new("planning/setpoint"):
             self._accept(message, t)
         while self._pending and self._pending[0].stamp <= followed:
@@ -113,20 +114,20 @@ class ControlService(Service):
             old = Problem("joint_states", f"joint_states: measured {age:.0f} ms ago, limit {limit:.0f} ms")
             expired = Problem(TOPIC, f"the last {TOPIC} expired {(t - self._setpoint_expires) / MS:.0f} ms ago")
             return self._stop_commands(t, self._stop_reason or (old if frozen else self._refused or expired))
-        if t - received > self._joint_states_age:
-            age, limit = (t - received) / MS, self._joint_states_age / MS
-            return self._repeat(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
+        stale = self._stale(t, received, inbox)
+        if stale is not None and not (self._positions and t < self._last_expires):
+            return self._repeat(t, stale)
         q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
         if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
             wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}, finite"
             return self._stop_commands(t, Problem("joint_states", wrong))
-        if self._admittance is not None and (stale := self._sense(self._admittance, t, inbox)):
-            return self._repeat(t, stale)
         reference = self._reference.at(followed)
-        command = self._controller.command(q, qd, reference)
-        self._last, self._last_expires = command, t + self._command_expiry
-        far = self._too_far(reference.setpoint, q)
-        return self._stop_commands(t, Problem(TOPIC, far)) if far else self._command(t, command, self._full_validity)
+        self._last = self._controller.command(q, qd, reference)
+        if far := self._too_far(reference.setpoint, q):
+            return self._stop_commands(t, Problem(TOPIC, far))
+        if stale is None:
+            self._last_expires = t + self._command_expiry
+        return self._command(t, self._last, self._full_validity) if stale is None else self._repeat(t, stale)
 
     def finish(self) -> Mapping[str, Any]:
         """Return counts of set-points and rejections, the last problem, and the largest torques [N m] if it commands torques."""
@@ -187,10 +188,15 @@ class ControlService(Service):
             self._last = np.array(joints.position)
         return self._command(t, self._last, self._full_validity, problem)
 
-    def _sense(self, admittance: AdmittanceController, t: int, inbox: Inbox) -> Problem | None:
-        """Pass the newest F/T reading to the law; return a problem if it is stale."""
+    def _stale(self, t: int, joints_received: int, inbox: Inbox) -> Problem | None:
+        """Pass F/T readings to a law that takes them; return a problem if they or the joint states are stale."""
+        if t - joints_received > self._joint_states_age:
+            late, limit = (t - joints_received) / MS, self._joint_states_age / MS
+            return Problem("joint_states", f"joint_states: {late:.0f} ms old, limit {limit:.0f} ms")
+        if self._admittance is None:
+            return None
         for message in inbox.new("robot/status"):
-            admittance.sense(wrench(message.wrench)[:3], commanded=message.mode == RobotStatus.MODE_ACTIVE)
+            self._admittance.sense(wrench(message.wrench)[:3], commanded=message.mode == RobotStatus.MODE_ACTIVE)
         received = inbox.stamp("robot/status")
         if received is None or t - received > self._status_age:
             age = "none yet" if received is None else f"{(t - received) / MS:.0f} ms old"

@@ -89,6 +89,6 @@ def setpoint(
     return Setpoint(**(fields | changes))  # type: ignore[arg-type]
 
 
-def reference(setpoint_: Setpoint) -> Reference:
-    """Return a set-point as the law follows it, without extrapolation."""
-    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros_like(setpoint_.q))))
+def reference(setpoint_: Setpoint, t: int = 0) -> Reference:
+    """Return a set-point as the law follows it at `t` [ns], without extrapolation."""
+    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros_like(setpoint_.q))), t)

@@ -251,7 +251,12 @@ def test_a_clock_that_is_set_back_makes_no_gap_wider() -> None:
 
 
 def test_silent_sender_is_braked_smoothly() -> None:
-    """Set-points stop: the motion continues for the bridging time, brakes within 25 ms and stands."""
+    """Set-points stop: the motion goes on for the bridging time, then brakes within 25 ms; in free motion it brakes softly."""
+    guide = Extrapolator(10 * MS)
+    guide.accept(at(0, 0.0, 1.0, ControlMode.JOINT), 0)
+    rates = np.array([guide.at(t * MS).motion.qd[0] for t in range(700)])
+    assert np.abs(np.diff(rates)).max() * 1e3 < 1.01 / TUNING.free_braking_s
+    assert rates[-1] < 1e-2
     guide = Extrapolator(10 * MS)
     guide.accept(at(0, 0.0, 0.1), 0)
     values = [guide.at(t * MS) for t in range(200)]
@@ -261,7 +266,7 @@ def test_silent_sender_is_braked_smoothly() -> None:
     assert v[bridge] == pytest.approx(0.1)
     assert v[bridge + 1] > 0.07
     assert abs(v[bridge + 30]) < 1e-3
-    assert p[-1] == pytest.approx(0.1 * bridge * 1e-3)
+    assert p[-1] == pytest.approx(0.1 * (bridge * 1e-3 + TUNING.smoothing_s))
 
 
 def test_change_of_mode_starts_afresh() -> None:

@@ -70,13 +70,13 @@ class Views:
     @property
     def posture(self) -> Array:
         """The posture to look from [rad], shape (n,)."""
-        return self.postures[self.failed]
+        return self.postures[self.failed % len(self.postures)]
 
     def fail(self) -> bool:
-        """Turn to the next posture; return True if none is left."""
+        """Turn to the next posture, or to the first one again; return True if there are to be no more views."""
         self.asked = None
         self.failed += 1
-        return self.failed >= min(EXAM.looks_max, len(self.postures))
+        return self.failed >= EXAM.looks_max
 
     def restart(self) -> None:
         """Begin with the first posture again."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
-from palpate_models.numerics.frames import rigid
+from palpate_models.numerics.frames import apply, inverse, rigid
 from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import arm_path
 from palpate_models.scenario.schema import Limits, Robot
@@ -205,6 +205,15 @@ def test_scan_postures_leave_the_view_free_and_differ() -> None:
     assert len(postures) >= 3
     assert np.array_equal(postures[0], lbr.HOME)
     assert all(np.abs(a - b).max() > 0.5 for i, a in enumerate(postures) for b in postures[:i])
+
+
+def test_no_scan_posture_leaves_the_workspace() -> None:
+    exam = known(Robot())
+    kinematics, X_AW = ArmKinematics(exam.robot, exam.limits), inverse(np.array(exam.X_WA))
+    sides = [apply(X_AW, kinematics.pose(q)[:3, 3])[1] for q in look_postures(exam)]
+    narrow = exam.limits.model_copy(update={"workspace_max_m": (0.7, max(sides) - 0.01, 1.2)})
+    inside = look_postures(exam.model_copy(update={"limits": narrow}))
+    assert [apply(X_AW, kinematics.pose(q)[:3, 3])[1] for q in inside] == [y for y in sides if y < max(sides)]
 
 
 def test_scan_postures_are_within_the_limits_of_the_first_joint(tmp_path: Path) -> None:

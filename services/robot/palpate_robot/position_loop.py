@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages import NS
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
 from palpate_robot.plant import DT
@@ -25,8 +26,10 @@ class PositionLoopTuning(NamedTuple):
     """k over the torque limit [1/rad]: 15 N on an outstretched arm turn its shoulder by 0.7 mrad."""
     settling_s: float = 0.02
     """d / k: time constant with which an error of position decays."""
-    latency_s: float = 0.010
-    """Delay from a command to the start of its motion."""
+    latency_ns: int = 11_000_000
+    """Delay from the time of a command to its motion. Commands are interpolated, so that their jitter does not jerk the arm."""
+    extrapolation_ns: int = 20_000_000
+    """Time for which the motion goes on where no newer command has come, as a UR's driver and a Franka's do."""
     reference_radps: float = 100.0
     """Frequency of the reference."""
     acceleration_factor: float = 2.0
@@ -34,6 +37,7 @@ class PositionLoopTuning(NamedTuple):
 
 
 TUNING = PositionLoopTuning()
+_STEP = round(DT * NS)
 
 
 class PositionLoop:
@@ -47,29 +51,42 @@ class PositionLoop:
         """Damping to take implicitly [N m s/rad]."""
         self._limits = (arm.velocity_radps, tuning.acceleration_factor * arm.acceleration_radps2, arm.torque_nm)
         self._frequency = tuning.reference_radps
+        self._latency, self._extrapolation = tuning.latency_ns, tuning.extrapolation_ns
         self._goal, self._r, self._rd = q, q.copy(), np.zeros_like(q)
-        self._late = deque([q] * round(tuning.latency_s / DT))
-        """Commands that have not taken effect yet."""
+        self._commands = deque([(-_STEP, q)])
+        """Time [ns] and positions of the command in effect and of later ones."""
+        self._t = 0
 
-    def torque(self, command: Array | None, q: Array, v: Array, gravity: Array) -> Array:
+    def torque(self, command: Array | None, q: Array, v: Array, gravity: Array, age: int = 0) -> Array:
         """Return the explicit part of the torques without gravity [N m] for a step at measured `q` [rad] and `v` [rad/s].
 
         It is within the torque limits together with gravity and with the implicit damping at the present `v`. Without a command
-        the arm stops as fast as it may and stays.
+        the arm stops as fast as it may and stays. `age` of the command [ns]: negative if its sender is ahead of the arm.
         """
+        self._t += _STEP
         speed, acceleration, limit = self._limits
         if command is None:
             wanted = -self._rd / DT
         else:
-            self._late.append(command)
-            before, self._goal = self._goal, self._late.popleft()
+            if self._t - age > self._commands[-1][0]:
+                self._commands.append((self._t - age, command))
+            before, self._goal = self._goal, self._interpolated(self._t - self._latency)
             error, error_rate = self._goal - self._r, (self._goal - before) / DT - self._rd
             wanted = self._frequency**2 * error + 2 * self._frequency * error_rate
         self._rd = np.clip(self._rd + DT * np.clip(wanted, -acceleration, acceleration), -speed, speed)
         self._r = self._r + DT * self._rd
         if command is None:
             self._goal = self._r
-            self._late = deque([self._r] * len(self._late))
+            self._commands = deque([(self._t - _STEP, self._r)])
         damped = self.damping * v
         drives = self._stiffness * (self._r - q) + self._rate * self._rd - damped + gravity
         return np.asarray(np.clip(drives, -limit, limit) - gravity + damped)
+
+    def _interpolated(self, t: int) -> Array:
+        """Return the commanded positions at `t` [ns]; before the first command, that one."""
+        while len(self._commands) > 2 and self._commands[1][0] <= t:
+            self._commands.popleft()
+        (t_0, q_0), (t_1, q_1) = self._commands[0], self._commands[-1] if len(self._commands) == 1 else self._commands[1]
+        if t <= t_0 or t_1 == t_0:
+            return q_0
+        return np.asarray(q_0 + (min(t, t_1 + self._extrapolation) - t_0) / (t_1 - t_0) * (q_1 - q_0))

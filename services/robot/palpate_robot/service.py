@@ -16,7 +16,7 @@ from palpate_models.robot.arm import arm_of, link_names, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
-from palpate_robot.driver import Driver
+from palpate_robot.driver import TUNING, Driver
 from palpate_robot.plant import DT, PlantFactory
 from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
@@ -104,10 +104,11 @@ class RobotService(Service):
         self._t = t
         command = self._commands.newest(inbox.latest("control/joint_torque"))
         self._read_contact(t, inbox)
-        for _ in range(steps):
+        for step in range(steps):
             gravity = plant.gravity_torque()
             values = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
-            torque, damping = self._act(values, gravity)
+            age = 0 if command is None else max(t - (steps - 1 - step) * _TICK - command.stamp, -TUNING.validity_ns)
+            torque, damping = self._act(values, gravity, age)
             driven = gravity + torque
             plant.step(driven, self._force_W if self._pressed else None, self._moment_W, damping)
             joints.update(plant.q, plant.v, driven)
@@ -118,12 +119,12 @@ class RobotService(Service):
             else:
                 self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * joints.v
 
-    def _act(self, values: Array, gravity: Array) -> tuple[Array, Array]:
-        """Return torque without gravity [N m] and damping [N m s/rad] of a step, for the values that the driver applies."""
+    def _act(self, values: Array, gravity: Array, age: int) -> tuple[Array, Array]:
+        """Return torque without gravity [N m] and damping [N m s/rad] of a step, for values of that `age` [ns]."""
         if self._loop is None:
             return values, self._driver.damping(self._joints.v, gravity)
         command = values if self._driver.mode is DriverMode.ACTIVE else None
-        return self._loop.torque(command, self._joints.q, self._joints.v, gravity), self._loop.damping
+        return self._loop.torque(command, self._joints.q, self._joints.v, gravity, age), self._loop.damping
 
     def _read_contact(self, t: int, inbox: Inbox) -> None:
         """Read the tissue's wrench: zero before its first message and after the tissue is lost.

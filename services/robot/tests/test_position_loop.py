@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from palpate_bus.messages import NS
 from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Robot
@@ -23,9 +24,9 @@ class Arm:
         self.plant = plant(Robot())
         self.loop = PositionLoop(ARM, self.plant.q)
 
-    def step(self, command: np.ndarray | None, force_W: np.ndarray | None = None) -> np.ndarray:
+    def step(self, command: np.ndarray | None, force_W: np.ndarray | None = None, age: int = 0) -> np.ndarray:
         gravity = self.plant.gravity_torque()
-        torque = self.loop.torque(command, self.plant.q, self.plant.v, gravity)
+        torque = self.loop.torque(command, self.plant.q, self.plant.v, gravity, age)
         assert (np.abs(torque + gravity - self.loop.damping * self.plant.v) <= ARM.torque_nm + 1e-9).all()
         self.plant.step(gravity + torque, force_W, np.zeros(3), self.loop.damping)
         return self.plant.q - HOME
@@ -36,8 +37,20 @@ def test_a_ramp_is_followed_after_the_latency(plant: type) -> None:
     arm, speed = Arm(plant), 0.3
     for k in range(500):
         moved = arm.step(HOME + speed * k * DT)
-    np.testing.assert_allclose(moved, speed * (499 * DT - TUNING.latency_s), atol=1.5e-3)
+    np.testing.assert_allclose(moved, speed * (499 * DT - TUNING.latency_ns / NS), atol=1.5e-3)
     assert np.abs(arm.plant.v - speed).max() < 0.02
+
+
+def test_late_and_missed_commands_do_not_jerk_it() -> None:
+    """By the wall clock commands come late, in bursts, and not all of them."""
+    arm, speed, ages = Arm(DartPlant), 0.3, np.random.default_rng(1)
+    newest = 0
+    for k in range(500):
+        if k - newest > ages.integers(1, 12):
+            newest = k
+        arm.step(HOME + speed * newest * DT, age=(k - newest) * MS)
+        if k > 200:
+            assert np.abs(arm.plant.v - speed).max() < 0.02
 
 
 @pytest.mark.parametrize("plant", [DartPlant, MujocoPlant])

@@ -89,8 +89,8 @@ class SupervisorService(Service):
                 breaches.append(Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit="operator/request"))
         for mesh in inbox.new("perception/surface"):
             breaches += self._take_surface(mesh)
-        if inbox.new("robot/status"):
-            self._measured = self._measure(t, inbox.latest("robot/status"))
+        if measured := inbox.new("robot/status"):  # several after a late step: the joints' force follows from each
+            self._measured = [breach for status in measured for breach in self._measure(t, status)]
         breaches += self._measured  # valid until the next measurement
         for stated in inbox.new("exam/state"):
             skin_W = vector(stated.surface_point), vector(stated.surface_normal)

@@ -150,7 +150,8 @@ def look_postures(known: ExamInput, *, hidden: bool = True) -> list[Array]:
     """Return collision-free postures to look from [rad], shape (n,) each: those that leave the view free first, by their turn.
 
     They are the home posture, and it turned by the first joint within its limits: the arm cannot follow a set-point beyond
-    them, and jumps once the motion from there comes back within them. `hidden`: also those that may hide the view.
+    them, and jumps once the motion from there comes back within them. The supervisor stops a tool outside the workspace.
+    `hidden`: also those that may hide the view.
     """
     kinematics = ArmKinematics(known.robot, known.limits)
     size = (known.exam.region_m[0] + 2 * SCAN.view_margin_m, known.exam.region_m[1] + 2 * SCAN.view_margin_m)
@@ -161,7 +162,9 @@ def look_postures(known: ExamInput, *, hidden: bool = True) -> list[Array]:
     for turn in SCAN.turns_rad:
         q = kinematics.arm.home_rad.copy()
         q[0] += turn
-        within = not turn or kinematics.lower[0] <= q[0] <= kinematics.upper[0]
+        p_A = apply(inverse(np.array(known.X_WA)), kinematics.pose(q)[:3, 3])
+        inside = (np.array(known.limits.workspace_min_m) < p_A) & (p_A < np.array(known.limits.workspace_max_m))
+        within = not turn or (kinematics.lower[0] <= q[0] <= kinematics.upper[0] and inside.all())
         if within and scene.free(q) and (hidden or view.clear(q)):
             postures.append(q)
     return sorted(postures, key=lambda q: not view.clear(q))
