@@ -31,7 +31,6 @@ from palpate_models.scenario.schema import Scenario
 SLOT_MS = 100
 MODULES: dict[str, tuple[str, ...]] = {
     "law": ("palpate_control.impedance",),
-    "safety net": ("palpate_control.safety",),
     "driver's limits": ("palpate_robot.driver",),
     "arm's kinematics": ("palpate_robot.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.tissue", "palpate_tissue.contact"),

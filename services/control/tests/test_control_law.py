@@ -7,7 +7,7 @@ from control_plant import ROBOT, WORKING, reference, setpoint
 from hypothesis import given, settings, strategies as st
 
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_control import impedance, safety
+from palpate_control import impedance
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import TUNING, Extrapolator, Reference
@@ -27,7 +27,7 @@ def arm() -> ArmModel:
 @pytest.fixture
 def unlimited(arm: ArmModel, monkeypatch: pytest.MonkeyPatch) -> ImpedanceController:
     """Return the law without its rate limit."""
-    monkeypatch.setattr(safety, "TORQUE_RATE_NM_PER_MS", 1e9)
+    monkeypatch.setattr(impedance, "TORQUE_RATE_NM_PER_MS", 1e9)
     return ImpedanceController(arm)
 
 
@@ -98,7 +98,7 @@ def test_torque_changes_by_at_most_a_newton_metre_a_millisecond(arm: ArmModel, m
     before = np.zeros(7)
     for _ in range(200):
         after = controller.command(q, REST, ref)
-        assert np.abs(after - before).max() <= ms * safety.TORQUE_RATE_NM_PER_MS + 1e-12
+        assert np.abs(after - before).max() <= ms * impedance.TORQUE_RATE_NM_PER_MS + 1e-12
         before = after
     assert np.abs(before).max() > 20
 
@@ -121,7 +121,7 @@ def test_command_and_gravity_together_stay_within_the_limits(arm: ArmModel, unli
 def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint: int, side: float) -> None:
     q = np.array(HOME)
     q[joint] = side * (POSITION_LIMIT[joint] - 0.06)
-    net = safety.SafetyNet(arm.position_lower, arm.position_upper, arm.torque_limit, 0.05, 1e-3)
+    net = impedance.SafetyNet(arm.position_lower, arm.position_upper, arm.torque_limit, 0.05, 1e-3)
     assert not net.torque(np.zeros(7), q, np.zeros(7)).any()
     pushes = []
     for inside in (0.04, 0.02, 0.0, -0.05):
@@ -129,7 +129,7 @@ def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint
         ref = reference(setpoint(arm, q, mode=ControlMode.JOINT))
         pushes.append(-side * unlimited.command(q, REST, ref)[joint])
     assert 0 < pushes[0] < pushes[1] < pushes[2] <= pushes[3]
-    assert pushes[3] == pytest.approx(safety.REPULSION_FRACTION * TORQUE_LIMIT[joint])
+    assert pushes[3] == pytest.approx(impedance.REPULSION_FRACTION * TORQUE_LIMIT[joint])
 
 
 def test_stretched_out_arm_gives_finite_torque(arm: ArmModel) -> None:

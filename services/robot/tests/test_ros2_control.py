@@ -11,9 +11,8 @@ from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
 from palpate_models.robot.urdf_arm import load_arm
 from palpate_models.scenario.load import load_scenario
-from palpate_robot.backends.ros2_control.checks import FirstContactCheck
 from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules
-from palpate_robot.backends.ros2_control.service import create
+from palpate_robot.backends.ros2_control.service import FirstContactCheck, create
 
 MS = 1_000_000
 WALL_NPM = 2000.0

@@ -4,11 +4,13 @@ The profile that `robot.driver.profile` names has topics and conventions of the 
 effect is an error, and so is a force that pulls the tool out at the first contact.
 """
 
+from collections import deque
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from palpate_bus.messages import NS
 from palpate_bus.messages.codes import HoldCause
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
@@ -19,11 +21,32 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
-from palpate_robot.backends.ros2_control.checks import TUNING, FirstContactCheck, FollowCheck
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
 from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port, tool_load
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 
+
+class CheckTuning(NamedTuple):
+    """Constants of the checks (assumed)."""
+
+    window_s: float = 0.3
+    """Commands of this time count, and a deviation lasts as long before it is reported: an arm at level position lags by less."""
+    every_s: float = 0.02
+    position_rad: float = 0.02
+    """Maximum distance of a measured position from all commanded ones of the window."""
+    torque_nm: float = 6.0
+    """Maximum distance of a torque from all commanded ones: more than friction, load data and sensors of an arm cause."""
+    pose_m: float = 0.1
+    """Maximum distance of the tool's pose under a Cartesian impedance of the stack: a spring that yields."""
+    contact_n: float = 2.0
+    """Change of the external force that counts as a contact: beyond noise and inertia of the tool."""
+    baseline_s: float = 2.0
+    """Time constant of the force in free motion."""
+    axial: float = 0.5
+    """Minimum share of the force along the tool for a verdict: a push from the side says nothing."""
+
+
+TUNING: Final = CheckTuning()
 DAMPING_SHARE: Final = 0.1
 """Maximum joint damping in a hold over that of the simulated driver (assumed): it acts one to three cycles late."""
 _TOLERANCE: Final = {
@@ -31,6 +54,61 @@ _TOLERANCE: Final = {
     CommandLevel.POSITION: TUNING.position_rad,
     CommandLevel.SETPOINT: TUNING.pose_m,
 }
+
+
+class FollowCheck:
+    """Checks if measurements follow commands."""
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance = tolerance
+        self._recent: deque[tuple[int, Array]] = deque()
+        self._since: int | None = None
+
+    def reset(self) -> None:
+        """Forget what was commanded, as after a hold."""
+        self._recent.clear()
+        self._since = None
+
+    def stray(self, t: int, command: Array, measured: Array) -> int | None:
+        """Take a command and a measurement at `t` [ns], shapes (n,); return the component that does not follow, or None."""
+        recent = self._recent
+        if recent and t - recent[-1][0] < TUNING.every_s * NS:
+            return None
+        recent.append((t, command))
+        while t - recent[0][0] > TUNING.window_s * NS:
+            recent.popleft()
+        commands = np.array([values for _, values in recent])
+        off = np.maximum(measured - commands.max(axis=0), commands.min(axis=0) - measured)
+        worst = int(np.argmax(off))
+        if not off[worst] > self._tolerance:
+            self._since = None
+            return None
+        self._since = t if self._since is None else self._since
+        return worst if t - self._since >= TUNING.window_s * NS else None
+
+
+class FirstContactCheck:
+    """Checks once that the force of the first contact pushes the tool back along its axis, which points out of the flange."""
+
+    def __init__(self) -> None:
+        self.passed = False
+        self._baseline: Array | None = None
+        self._at = 0
+
+    def wrong(self, t: int, force_S: Array) -> bool:
+        """Take the external force at `t` [ns] in the sensor's axes [N], shape (3,); return True if it pulls the tool out."""
+        if self.passed:
+            return False
+        if self._baseline is None:
+            self._baseline, self._at = force_S, t
+        change = force_S - self._baseline
+        size = float(np.linalg.norm(change))
+        if size < TUNING.contact_n or abs(change[2]) < TUNING.axial * size:
+            share = 1.0 - np.exp(-(t - self._at) / NS / TUNING.baseline_s)
+            self._baseline, self._at = self._baseline + share * change, t
+            return False
+        self.passed = bool(change[2] < 0)
+        return not self.passed
 
 
 class Ros2ControlService(HardwareService):
