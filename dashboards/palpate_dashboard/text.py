@@ -51,7 +51,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
     flags = [name.replace("_", " ") for name in CONTACT_FLAGS if getattr(exam, name)]
     depth_mm = 1e3 * exam.depth
     speed = [] if real_time_factor is None else [f"| speed | {real_time_factor:.1f} x real time |"]
-    depth = f"{depth_mm:.1f} mm" if exam.depth > FREE_M else "not in contact"
+    depth = f"{depth_mm:.1f} mm" if exam.depth > FREE_M else "above the skin"
     return "\n".join((
         f"**{scenario}: {phase}.** {exam.message}",
         "",
