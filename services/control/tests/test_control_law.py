@@ -251,7 +251,7 @@ def test_a_clock_that_is_set_back_makes_no_gap_wider() -> None:
 
 
 def test_silent_sender_is_braked_smoothly() -> None:
-    """Set-points stop: the motion goes on for the bridging time, then brakes within 25 ms; in free motion it brakes softly."""
+    """Set-points stop: the motion continues for the bridging time, then brakes within 25 ms; in free motion it brakes softly."""
     guide = Extrapolator(10 * MS)
     guide.accept(at(0, 0.0, 1.0, ControlMode.JOINT), 0)
     rates = np.array([guide.at(t * MS).motion.qd[0] for t in range(700)])

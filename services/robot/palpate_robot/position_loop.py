@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages import NS
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
 from palpate_robot.plant import DT
@@ -29,7 +28,7 @@ class PositionLoopTuning(NamedTuple):
     latency_ns: int = 11_000_000
     """Delay from the time of a command to its motion. Commands are interpolated, so that their jitter does not jerk the arm."""
     extrapolation_ns: int = 20_000_000
-    """Time for which the motion goes on where no newer command has come, as a UR's driver and a Franka's do."""
+    """Time for which the motion continues where no newer command has come, as a UR's driver and a Franka's do."""
     reference_radps: float = 100.0
     """Frequency of the reference."""
     acceleration_factor: float = 2.0
@@ -37,7 +36,7 @@ class PositionLoopTuning(NamedTuple):
 
 
 TUNING = PositionLoopTuning()
-_STEP = round(DT * NS)
+_STEP = round(DT * 1e9)  # [ns]
 
 
 class PositionLoop:
