@@ -47,10 +47,6 @@ class AdmittanceTuning(NamedTuple):
     """Damping of the least squares: a motion that moves the tool by less per rad follows the posture instead of the pose."""
     damping_rad: float = 0.3
     """Damping for turns of the tool [1]: near a singularity it tilts by a few degrees, and its place stays."""
-    pause_s: float = 0.02
-    """Maximum time for which one command integrates: 1 / `follow_per_s`."""
-    acceleration_factor: float = 1.0
-    """Maximum commanded acceleration over that of free motion: late set-points must not jerk the arm."""
     speed_share: float = 0.8
     """Maximum commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
 
@@ -96,7 +92,7 @@ class AdmittanceController:
         """Return the joint positions to command [rad], shape (n,), at measured positions `q` [rad]; `qd` is not used."""
         if self._q is None:
             self._q = np.array(q, dtype=float)
-        dt = 0.0 if self._t is None else min(max(reference.t - self._t, 0) * 1e-9, TUNING.pause_s)
+        dt = 0.0 if self._t is None else min(max(reference.t - self._t, 0) * 1e-9, 1 / TUNING.follow_per_s)
         self._t = reference.t
         model, motion = self.model, reference.motion
         model.update_kinematics(self._q)
@@ -108,7 +104,7 @@ class AdmittanceController:
         else:
             rate = self._cartesian(reference, dt)
         rate = rate / max(1.0, float(np.max(np.abs(rate) / (TUNING.speed_share * model.velocity_limit))))
-        change = TUNING.acceleration_factor * self._acceleration * dt
+        change = self._acceleration * dt  # late set-points must not jerk the arm
         self._rate = np.clip(rate, self._rate - change, self._rate + change)
         low, high = np.minimum(self._lower, self._q), np.maximum(self._upper, self._q)
         self._q = np.clip(self._q + dt * self._rate, low, high)

@@ -84,11 +84,13 @@ def test_it_yields_no_further_than_its_limit() -> None:
 @pytest.mark.parametrize("mode", list(ControlMode))
 def test_no_set_point_turns_a_joint_faster_or_further_than_it_may(mode: ControlMode) -> None:
     contact = Contact()
-    far = contact.asked + 3.0
+    far, rate = contact.asked + 3.0, np.zeros(7)
     for _ in range(400):
         before = contact.q
         contact.follow(mode, np.zeros(3), 1, q=far, p_WD=np.array((2.0, 0.0, 2.0)))
-        assert (np.abs(contact.q - before) <= 1.001e-3 * TUNING.speed_share * contact.model.velocity_limit).all()
+        slower, rate = rate, (contact.q - before) * 1e3
+        assert (np.abs(rate) <= 1.001 * TUNING.speed_share * contact.model.velocity_limit).all()
+        assert (rate - slower <= 1.001e-3 * lbr.ARM.acceleration_radps2).all()
     assert (np.abs(contact.q) <= contact.model.position_upper).all()
 
 

@@ -175,6 +175,21 @@ def test_while_joint_states_are_stale_the_last_torque_stands_no_longer_than_it_w
     assert not ceased.torque.any()
 
 
+def test_while_joint_states_are_stale_positions_follow_the_setpoints_no_longer_than_they_were_valid() -> None:
+    rig = Rig(CommandLevel.POSITION)
+    rig.send(setpoint(0))
+    last, since = np.array(rig.tick(5).position), rig.t
+    for _ in range(100):
+        rig.t += MS
+        rig.inbox.put("robot/status", status(rig.t), rig.t)
+        command = rig.service.step(rig.t, rig.inbox)["control/joint_torque"]
+        if valid_for(command) <= 0:
+            break
+        assert (np.abs(command.position - last) > 0).all()
+        last = np.array(command.position)
+    assert EXPIRY < rig.t - since < EXPIRY + 25 * MS
+
+
 def moving(t: int) -> np.ndarray:
     """Joint 1 at 0.8 rad/s from HOME, the others at rest."""
     return np.array(HOME) + 0.8 * 1e-9 * t * np.eye(7)[0]
