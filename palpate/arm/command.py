@@ -57,6 +57,7 @@ def place(
     arm: Name,
     scenario: Annotated[str, typer.Argument(help="Scenario whose region is to be reached, by name or file.")] = DEFAULT_SCENARIO,
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("place.png"),
+    height: Annotated[float | None, typer.Option("--height", help="Keep this height of the base [m].", min=0.3, max=1.4)] = None,
     settings: Settings = None,
 ) -> None:
     """Find where the base should stand to reach a scenario's region, and draw which targets it reaches."""
@@ -70,7 +71,7 @@ def place(
     chosen = check_usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None, elsewhere=True)
     console = SteadyConsole()
     with SteadyConsole(stderr=True).status("optimising: about a minute"):
-        robot = best_placement(chosen)
+        robot = best_placement(chosen, height_m=height)
         targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, PLACEMENT.raised_m)]
         (deep, touched), (raised, _) = (clear_postures(robot, *pair, chosen.limits) for pair in targets)
     console.print(f"pressed: {describe(robot, deep)}", soft_wrap=True)

@@ -45,17 +45,21 @@ STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (
 """Placements to start from, after the robot's own; the best result counts, as the problem is not convex."""
 
 
-def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
+def best_placement(scenario: Scenario, spacing: float = 0.06, height_m: float | None = None) -> Robot:
     """Return the robot on the base placement with the lowest cost over the scenario's region.
 
     It is rounded to centimetres and hundredths of a radian. A placement counts whose targets inverse kinematics reaches and
-    where no shapes touch, as in an examination. Raises RunError with the best attempt if there is none.
+    where no shapes touch, as in an examination. `height_m` is that of a base whose height cannot change. Raises RunError with the
+    best attempt if there is none.
     """
     contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
     raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
-    starts = (base_of(scenario.robot), *map(np.array, STARTS))
-    attempts = [_optimise(scenario.robot, positions, normals, start) for start in starts]
+    starts = [base_of(scenario.robot), *map(np.array, STARTS)]
+    if height_m is not None:
+        for start in starts:
+            start[2] = height_m
+    attempts = [_optimise(scenario.robot, positions, normals, start, height_m) for start in starts]
     tried = []
     converged = [pair for pair in attempts if pair[0] < np.inf]
     for _, robot in sorted(converged or attempts, key=itemgetter(0)):
@@ -73,7 +77,7 @@ def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
     )
 
 
-def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> tuple[float, Robot]:
+def _optimise(robot: Robot, positions: Array, normals: Array, start: Array, height_m: float | None) -> tuple[float, Robot]:
     """Return the cost [1] before rounding, infinite without convergence, and the placed robot from one start by Ipopt."""
     ca = casadi()
     count = len(positions)
@@ -87,6 +91,8 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
     costs = functions.cost.map(count)(Q, bases, POSTURES.pressing_force_n)[0]
     turn = start[3] if abs(start[3]) > BOUNDS[1][3] else 0.0  # the user's own: not every arm faces its base's x
     sides = [bound + np.array((0.0, 0.0, 0.0, turn)) for bound in BOUNDS]
+    if height_m is not None:
+        sides[0][2] = sides[1][2] = height_m
     objective = worst + PLACEMENT.mean_weight * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3] - turn))
     first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), POSTURES.pressing_force_n)[0]
     residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
@@ -104,8 +110,10 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> t
         lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
         ubg=np.concatenate((zeros, [TABLE.x_m[0] - PLACEMENT.clearance_m], np.zeros(count))),
     )
-    solution = np.array(result["x"])[:, 0]
-    return float(result["f"]) if solver.stats()["success"] else np.inf, _standing(robot, np.round(solution[:4], 2))
+    base_found = np.round(np.array(result["x"])[:4, 0], 2)
+    if height_m is not None:
+        base_found[2] = height_m
+    return float(result["f"]) if solver.stats()["success"] else np.inf, _standing(robot, base_found)
 
 
 def _standing(robot: Robot, base: Array) -> Robot:

@@ -6,6 +6,7 @@ import pytest
 
 from palpate_models.robot.arm import urdf
 from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT
+from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
 from palpate_planning.placement.redundancy import PostureSequence, plan_redundancy, prepare
@@ -128,6 +129,14 @@ def test_default_base_is_what_the_optimisation_finds() -> None:
     from palpate.arm.placement import best_placement
 
     np.testing.assert_allclose(base_of(best_placement(Scenario())), base_of(ROBOT), atol=0.011)
+
+
+@pytest.mark.slow
+def test_a_height_that_is_given_is_kept() -> None:
+    from palpate.arm.placement import best_placement
+
+    robot = best_placement(load_scenario("lump", ["exam.region_m=[0.04,0.04]"]), height_m=0.905)
+    assert robot.base_height_m == 0.905
 
 
 def test_a_placement_counts_by_what_inverse_kinematics_reaches(monkeypatch: pytest.MonkeyPatch) -> None:
