@@ -1,42 +1,28 @@
-"""A small FMU that behaves oddly on request, FMI 2.0 or 3.0: a wall of springs with input z and output f."""
+"""A small FMU that is not ours, FMI 2.0 or 3.0: a wall of springs with input z and output f that behaves oddly on request.
+
+If its parameter tau is not 0 it is three first-order lags in millimetres, y after u, with a fixed step of 10 ms (FMI 3.0).
+"""
 
 import tempfile
 import zipfile
-from collections.abc import Mapping
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
 
 from palpate_fmu.compiling import compile_library, native, platforms
 
-
-class Odd(IntEnum):
-    """Fault of a step, from the time of the parameter `at` on."""
-
-    NOTHING = 0
-    TERMINATE = 1
-    EARLY = 2
-    EVENT = 3
-    EARLY_AT_END = 4
-    DISCARD = 5
-    ERROR = 6
-    FATAL = 7
-    PENDING = 8
-    UNKNOWN = 9
-    WARNING = 10
-    NAN = 11
-    INFINITE = 12
-    ONLY_FROM_START = 13
-    """It can only be started at `at`."""
-
-
+Odd = IntEnum(
+    "Odd", "TERMINATE EARLY EVENT EARLY_AT_END DISCARD ERROR FATAL PENDING UNKNOWN WARNING NAN INFINITE ONLY_FROM_START"
+)
+"""Fault of a step, from the time of the parameter `at` on; the last one can only be started at `at`."""
 SOURCE = """
 #include <math.h>
 #include <stdbool.h>
 #include <stdlib.h>
+#include <string.h>
 
 #define EXPORT __attribute__((visibility("default")))
-typedef struct { double z, f, odd, at, reached, a[4]; unsigned long size; bool configuring; } Wall;
+typedef struct { double z, f, odd, at, reached, a[4], u[3], y[3], tau; unsigned long size; bool configuring; } Wall;
 
 static int start(Wall *w, double t) { return (int)w->odd == 13 && t != w->at ? 3 : 0; }
 
@@ -49,6 +35,8 @@ static int step(Wall *w, double t, double dt, bool *event, bool *end, bool *earl
     *end = odd == 1;
     *early = odd == 2 || odd == 4;
     w->reached = *last = odd == 2 || odd == 5 ? t + dt / 4 : t + dt;
+    if (w->tau && fabs(dt - 0.01) > 1e-9) return 3;
+    for (int k = 0; w->tau && k < 3; k++) w->y[k] += (1 - exp(-dt / w->tau)) * (w->u[k] - w->y[k]);
     return odd <= 10 ? status[odd] : 0;
 }
 
@@ -87,16 +75,15 @@ EXPORT int fmi2ExitInitializationMode(void *c) { return !c; }
 #else
 EXPORT void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l, bool e, bool w,
                                          const unsigned *i, size_t m, void *x, void *f, void *u) {
-    (void)n, (void)g, (void)r, (void)v, (void)l, (void)e, (void)w, (void)i, (void)m, (void)x, (void)f, (void)u;
-    return calloc(1, sizeof(Wall));
+    (void)n, (void)r, (void)v, (void)l, (void)e, (void)w, (void)i, (void)m, (void)x, (void)f, (void)u;
+    return strcmp(g, "wall") ? NULL : calloc(1, sizeof(Wall));
 }
+static size_t many(const Wall *w, unsigned vr) { return vr == 10 && w->size ? w->size : vr == 10 ? 4 : vr >= 20 ? 3 : 1; }
+static double *place(Wall *w, unsigned vr) { return vr == 10 ? w->a : vr == 20 ? w->u : vr == 21 ? w->y : (double *)w + vr; }
 EXPORT void fmi3FreeInstance(void *c) { free(c); }
 EXPORT int fmi3GetFloat64(void *c, const unsigned *vr, size_t n, double *v, size_t room) {
     (void)room;
-    for (size_t k = 0; k < n; k++) {
-        const unsigned long many = ((Wall *)c)->size ? ((Wall *)c)->size : 4;
-        for (unsigned j = 0; j < (vr[k] == 10 ? many : 1); j++) *v++ = vr[k] == 10 ? ((Wall *)c)->a[j] : ((double *)c)[vr[k]];
-    }
+    for (size_t k = 0; k < n; v += many(c, vr[k++])) memcpy(v, place(c, vr[k]), many(c, vr[k]) * sizeof *v);
     return 0;
 }
 EXPORT int fmi3EnterConfigurationMode(void *c) { return ((Wall *)c)->configuring = true, 0; }
@@ -108,7 +95,7 @@ EXPORT int fmi3SetUInt64(void *c, const unsigned *vr, size_t n, const unsigned l
 }
 EXPORT int fmi3SetFloat64(void *c, const unsigned *vr, size_t n, const double *v, size_t room) {
     (void)room;
-    for (size_t k = 0; k < n; k++) ((double *)c)[vr[k]] = v[k];
+    for (size_t k = 0; k < n; v += many(c, vr[k++])) memcpy(place(c, vr[k]), v, many(c, vr[k]) * sizeof *v);
     return 0;
 }
 EXPORT int fmi3GetBoolean(void *c, const unsigned *vr, size_t n, bool *v, size_t room) {
@@ -127,6 +114,16 @@ EXPORT int fmi3EnterInitializationMode(void *c, bool a, double b, double t, bool
 EXPORT int fmi3ExitInitializationMode(void *c) { return !c; }
 #endif
 """
+LAG = """<fmiModelDescription modelName="wall" fmiVersion="3.0" instantiationToken="wall">
+<CoSimulation modelIdentifier="wall" fixedInternalStepSize="0.01"/>
+<UnitDefinitions><Unit name="mm"><BaseUnit m="1" factor="0.001"/></Unit><Unit name="s"><BaseUnit s="1"/></Unit></UnitDefinitions>
+<ModelVariables>
+<Float64 name="time" valueReference="9" causality="independent" variability="continuous"/>
+<Float64 name="u" valueReference="20" causality="input" unit="mm" start="0 0 0"><Dimension start="3"/></Float64>
+<Float64 name="y" valueReference="21" causality="output" unit="mm"><Dimension start="3"/></Float64>
+<Float64 name="tau" valueReference="15" causality="parameter" variability="tunable" unit="s" start="0.1"/>
+</ModelVariables>
+<ModelStructure><Output valueReference="21"/><InitialUnknown valueReference="21"/></ModelStructure></fmiModelDescription>"""
 NAMES: tuple[tuple[str, str], ...] = (("z", "input"), ("f", "output"), ("odd", "parameter"), ("at", "parameter"))
 
 
@@ -139,8 +136,7 @@ def description(version: int, more: str = "", start: str = "", base: int | None 
     experiment = f'<DefaultExperiment startTime="{start}"/>' if start else ""
 
     def words(causality: str) -> str:
-        variability = "fixed" if causality == "parameter" else "continuous"
-        return f'causality="{causality}" variability="{variability}"'
+        return f'causality="{causality}" variability="{"fixed" if causality == "parameter" else "continuous"}"'
 
     def value(causality: str) -> str:
         return "" if causality == "output" else ' start="0"'
@@ -168,28 +164,26 @@ def description(version: int, more: str = "", start: str = "", base: int | None 
 
 
 @cache
-def library(name: str, source: str, version: int) -> tuple[str, bytes]:
+def library(version: int) -> tuple[str, bytes]:
     """Return name in the archive and content of an FMU's library for this platform, compiled once in a process.
 
-    FMPy wants every function of the standard to be there: those that `source` lacks answer fmi2Error or fmi3Error.
+    FMPy wants every function of the standard to be there: those that `SOURCE` lacks answer fmi2Error or fmi3Error.
     """
     from fmpy import fmi2, fmi3
 
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
-    missing = [function for function in dir(slave) if function.startswith(f"fmi{version}") and f"{function}(" not in source]
+    missing = [function for function in dir(slave) if function.startswith(f"fmi{version}") and f"{function}(" not in SOURCE]
     rest = "".join(f"EXPORT int {function}(void) {{ return 3; }}\n" for function in missing)
     (target,) = platforms(3, [native()])
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / f"{name}.c").write_text(f"#define FMI_VERSION {version}\n{source}{rest}")
-        content = compile_library(Path(folder), [f"{name}.c"], target)
-    return f"binaries/{target.tuple_3 if version == 3 else target.folder_2}/{name}{target.suffix}", content
+        (Path(folder) / "wall.c").write_text(f"#define FMI_VERSION {version}\n{SOURCE}{rest}")
+        content = compile_library(Path(folder), ["wall.c"], target)
+    return f"binaries/{target.tuple_3 if version == 3 else target.folder_2}/wall{target.suffix}", content
 
 
-def build_wall(path: Path, version: int, text: str = "", others: Mapping[str, str] | None = None) -> Path:
-    """Write the FMU for this platform, with `text` as its model description and `others` as further entries."""
+def build_wall(path: Path, version: int, text: str = "") -> Path:
+    """Write the FMU for this platform, with `text` as its model description."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", text or description(version))
-        archive.writestr(*library("wall", SOURCE, version))
-        for name, content in (others or {}).items():
-            archive.writestr(name, content)
+        archive.writestr(*library(version))
     return path
