@@ -17,7 +17,7 @@ from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import arm_of, tool_pose, urdf
+from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
@@ -55,7 +55,7 @@ class ControlService(Service):
         self._names, self._home, self._still = list(arm.joint_names), arm.home_rad, np.zeros(self.model.joints)
         topics = contract().topics
         zone = limits.joint_margin_rad
-        self._robot, self._positions = robot, robot.level is CommandLevel.POSITION
+        self._positions = robot.level is CommandLevel.POSITION
         reading_s = topics["robot/status"].period / NS
         law = AdmittanceController(self.model, arm, robot.tool_mass_kg, zone, reading_s) if self._positions else None
         self._admittance = law
@@ -171,7 +171,9 @@ class ControlService(Service):
         """Return a text for a Cartesian set-point that is too far from the tool to come from planning; empty for others."""
         if setpoint.mode is not ControlMode.CARTESIAN:
             return ""
-        gap = setpoint.p_WD - (tool_pose(q, self._robot)[:3, 3] if self._positions else self.model.p_WI)
+        if self._positions:
+            self.model.update_kinematics(q)  # the law evaluates it at the commanded positions
+        gap = setpoint.p_WD - self.model.p_WI
         if gap.dot(gap) <= SETPOINT_DISTANCE_MAX_M**2:
             return ""
         return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {SETPOINT_DISTANCE_MAX_M:g} m"
