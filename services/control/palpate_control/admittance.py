@@ -98,6 +98,7 @@ class AdmittanceController:
         model.update_kinematics(self._q)
         if reference.setpoint.mode is ControlMode.JOINT:
             self._tare(model.R_WI)
+            self._yield = np.zeros(3)
             error = motion.q - dt * motion.qd - self._q
             braked = np.sqrt(2 * self._acceleration * np.abs(error))
             rate = motion.qd + np.clip(TUNING.follow_per_s * error, -braked, braked)

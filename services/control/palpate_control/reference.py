@@ -135,16 +135,17 @@ class Extrapolator:
     def _coordinates(self, setpoint: Setpoint, t: int, faded: int) -> Array:
         """Return the coordinates at `t`, shape (18 + 3 n,), with the gap decayed until `faded` [ns]."""
         since, longest = (t - setpoint.stamp) * 1e-9, self._max_age * 1e-9
-        slowing = TUNING.free_braking_s if setpoint.mode is ControlMode.JOINT else TUNING.smoothing_s
-        braked = exp(min(longest - since, 0.0) / slowing)  # below 1 if set-points stopped
-        age = min(max(since, -longest), longest) + slowing * (1 - braked)
+        age = min(max(since, -longest), longest)
         fading = min(self._since - faded, 0) * 1e-9  # a clock that is set back does not widen the gap
         x: Array = np.array((1.0, age, age * age, exp(fading / TUNING.smoothing_s))).dot(self._terms)
-        if braked < 1.0:
-            n = len(setpoint.q)
-            x[TWIST] *= braked
-            x[JOINTS + n : JOINTS + 2 * n] *= braked
-            x[JOINTS + 2 * n :] = 0.0
+        if since > longest:  # set-points have stopped: the speed decays
+            slowing = TUNING.free_braking_s if setpoint.mode is ControlMode.JOINT else TUNING.smoothing_s
+            braked, n = exp((longest - since) / slowing), len(setpoint.q)
+            q, qd = slice(JOINTS, JOINTS + n), slice(JOINTS + n, JOINTS + 2 * n)
+            for place, speed in ((_POSE, TWIST), (q, qd)):
+                x[place] += slowing * (1 - braked) * x[speed]
+                x[speed] *= braked
+            x[qd.stop :] = 0.0
         return x
 
 

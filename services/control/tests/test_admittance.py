@@ -73,6 +73,14 @@ def test_without_a_tare_no_force_moves_the_tool() -> None:
     np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, PUSH), start, atol=1e-5)
 
 
+def test_a_free_motion_forgets_how_far_the_tool_has_yielded() -> None:
+    contact = Contact()
+    contact.follow(ControlMode.JOINT, np.zeros(3), 20)
+    contact.follow(ControlMode.CARTESIAN, 2.5 * PUSH)
+    start = contact.follow(ControlMode.JOINT, np.zeros(3), 3000)
+    np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, np.zeros(3), 20), start, atol=2e-5)
+
+
 def test_it_yields_no_further_than_its_limit() -> None:
     contact = Contact()
     start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)

@@ -258,6 +258,11 @@ def test_silent_sender_is_braked_smoothly() -> None:
     assert np.abs(np.diff(rates)).max() * 1e3 < 1.01 / TUNING.free_braking_s
     assert rates[-1] < 1e-2
     guide = Extrapolator(10 * MS)
+    guide.accept(at(0, 0.0, 0.0, ControlMode.JOINT), 0)
+    guide.accept(at(10 * MS, 0.0, 0.08, ControlMode.JOINT), 10 * MS)  # speeding up by 8 rad/s^2
+    motions = [guide.at((10 + t) * MS).motion for t in range(700)]
+    np.testing.assert_allclose(np.diff([m.q[0] for m in motions]) * 1e3, [m.qd[0] for m in motions[1:]], atol=0.01)
+    guide = Extrapolator(10 * MS)
     guide.accept(at(0, 0.0, 0.1), 0)
     values = [guide.at(t * MS) for t in range(200)]
     v = np.array([value.motion.V_WD[0] for value in values])
