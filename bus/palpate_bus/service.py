@@ -32,7 +32,10 @@ class Inbox(Protocol):
         """Return the messages since the step before, oldest first."""
 
     def stamp(self, topic: str) -> int | None:
-        """Return the time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode."""
+        """Return the time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode.
+
+        In wall-clock mode it is one period of the topic earlier on the edge `previous`.
+        """
 
     def lost(self, role: str) -> bool:
         """Return True if the service of that role is lost (its liveliness token vanished)."""

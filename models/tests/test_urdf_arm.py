@@ -19,7 +19,18 @@ TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "
 TENSOR = '<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><origin xyz="0 0 0.05"/><mass value="{{m}}"/>{TENSOR}</inertial>'
 XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>'
-FIELDS = ("flange", "flange_rpy_rad", "home_rad", "urdf", "base", "base_heigth_m", "base_yaw_rad", "seeds_rad", "lower_rad")
+FIELDS = (
+    "flange",
+    "flange_rpy_rad",
+    "home_rad",
+    "urdf",
+    "base",
+    "base_heigth_m",
+    "base_yaw_rad",
+    "seeds_rad",
+    "lower_rad",
+    "hold_damping_nms",
+)
 GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 
 
@@ -199,6 +210,7 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
         ({"text": XACRO}, "has xacro elements"),
         ({"urdf": "other.urdf"}, r"arm\.yaml: urdf: .*other\.urdf: no such file"),
         ({"base_heigth_m": 1}, r"base_heigth_m = 1: unknown field\. Did you mean base_height_m\?"),
+        ({"hold_damping_nms": [-40.0] * 6}, r"hold_damping_nms\.0 = -40"),
         ({"base_yaw_rad": -90}, r"base_yaw_rad = -90: expected greater than or equal to -6\.3 \(in radians\)"),
     ],
 )

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from palpate_errors import UserError
-from palpate_models.section import NonNegative, Section, Turn, Vec2, Vec3, read_model
+from palpate_models.section import NonNegative, Positive, Section, Turn, Vec2, Vec3, read_model
 
 FOLDER: Final = Path(__file__).with_name("arms")
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
@@ -17,6 +17,7 @@ DEFAULT_ARM: Final = "lbr"
 """The arm whose tables are built in."""
 Joints = tuple[float, ...]
 """One value a joint, from the base to the flange."""
+PositiveJoints = tuple[Positive, ...]
 
 
 class CommandLevel(StrEnum):
@@ -58,10 +59,10 @@ class ArmFile(Section):
     upper_rad: Joints | None = None
     velocity_radps: Joints | None = None
     torque_nm: Joints | None = None
-    acceleration_radps2: Joints | None = None
-    stiffness_nmprad: Joints | None = None
+    acceleration_radps2: PositiveJoints | None = None
+    stiffness_nmprad: PositiveJoints | None = None
     """Joint stiffness in free motion."""
-    hold_damping_nms: Joints | None = None
+    hold_damping_nms: PositiveJoints | None = None
     """Joint damping in a hold."""
     seeds_rad: tuple[Joints, ...] = ()
     """Postures from which inverse kinematics starts; home and others that are sought if missing."""
