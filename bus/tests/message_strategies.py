@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.messages.codec import message_type, store
 from palpate_bus.messages.typestore import array_dtype
 
-MAX_ITEMS = 4
+MAX_ITEMS = 3
 
 _INTEGER = {"byte": "int8", "char": "uint8"}
 
@@ -53,11 +54,4 @@ def _scalar(base: str) -> st.SearchStrategy[Any]:
 
 
 def _array(base: str, least: int, most: int) -> st.SearchStrategy[Any]:
-    dtype = array_dtype(base)
-    if base == "bool":
-        return st.lists(st.booleans(), min_size=least, max_size=most).map(lambda values: np.array(values, dtype))
-    return (
-        st.integers(least, most)
-        .flatmap(lambda size: st.binary(min_size=size * dtype.itemsize, max_size=size * dtype.itemsize))
-        .map(lambda data: np.frombuffer(data, dtype))
-    )
+    return arrays(array_dtype(base), st.integers(least, most))

@@ -7,31 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from message_strategies import messages
+from message_strategies import messages as drawn
+from toy_services import joint_state, torque_command, wrench
 
+from palpate_bus import messages as msg
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
-from palpate_bus.messages import (
-    MS,
-    DiagnosticArray,
-    DiagnosticStatus,
-    JointState,
-    JointTorqueCommand,
-    Time,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-    codec,
-    duration_message,
-    header,
-)  # fmt: skip
+from palpate_bus.messages import MS, codec, header
 from palpate_bus.messages.fields import leaves, numbers
-from palpate_bus.monitor.health import RECENT_S, Violation, topic_statuses
+from palpate_bus.monitor.health import RECENT_S, TopicHealth, Violation, topic_statuses
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
 
 RULES = contract()
-NAMES = [f"lbr_A{i}" for i in range(1, 8)]
 LOOK_MS = 50
 
 
@@ -41,19 +29,11 @@ def entity(node: str, topic: str, number: int, type_hash: str | None = None) -> 
     return Entity(0, "ab", 0, number, EntityKind.PUBLISHER, node, endpoint=end)
 
 
-def joint_state(t: int) -> Any:
-    return JointState(header(t), NAMES, np.zeros(7), np.zeros(7), np.zeros(7))
-
-
-def wrench(t: int) -> Any:
-    return WrenchStamped(header(t, "ft_sensor"), Wrench(Vector3(0.0, 0.0, 5.0), Vector3(0.0, 0.0, 0.0)))
-
-
-def torque(t: int) -> Any:
-    return JointTorqueCommand(header(t), np.zeros(7), np.zeros(0), duration_message(50 * MS), "", "")
-
-
-MAKE = {"joint_states": joint_state, "ft/wrench": wrench, "control/joint_torque": torque}
+MAKE: dict[str, Callable[[int], Any]] = {
+    "joint_states": joint_state,
+    "ft/wrench": lambda t: msg.WrenchStamped(header(t, "ft_sensor"), wrench(5.0)),
+    "control/joint_torque": torque_command,
+}
 
 
 @dataclass
@@ -87,24 +67,35 @@ class Bus:
                 for violation in self.monitor.check(wall, round(wall * 1e9)):
                     self.named.setdefault(f"{violation.topic} {violation.kind}", (self.tick, violation))
 
+    def health(self, name: str) -> TopicHealth:
+        return next(row for row in self.monitor.health() if row.topic.name == name)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    """Return a bus on which all has been well for a second."""
+    healthy = Bus()
+    healthy.run(1000)
+    return healthy
+
 
 def test_a_healthy_bus_has_no_violation_at_any_speed() -> None:
     for factor in (0.2, 1.0, 5.0):
         bus = Bus(factor=factor)
-        bus.run(3000)
+        bus.run(3000 if factor < 1 else 1500)
         assert bus.named == {}
-        assert all(row.alive for row in bus.monitor.health() if row.topic.name in MAKE)
+        assert all(bus.health(name).alive for name in MAKE)
 
 
 @pytest.mark.parametrize("rate", [0.25, 1.0])
 def test_a_wall_clock_run_is_judged_at_its_own_rate(rate: float) -> None:
     """In wall-clock mode stamps need not match sequence numbers: a late service continues at the present tick."""
     bus = Bus(monitor=Monitor(RULES, rate), factor=1 / rate)
-    bus.run(3000, lambda name, t, _: MAKE[name](t + 200 * MS if t > 1000 * MS else t))
+    bus.run(2000, lambda name, t, _: MAKE[name](t + 200 * MS if t > 1000 * MS else t))
     assert bus.named == {}
     assert bus.monitor.time.progress == pytest.approx(rate, rel=0.05)
     late = Bus(monitor=Monitor(RULES, rate), factor=2 / rate)
-    late.run(3000)
+    late.run(2000)
     assert set(late.named) == {f"{name} rate" for name in MAKE}
 
 
@@ -118,7 +109,7 @@ def spoiled(name: str, change: Callable[[Any], None]) -> Callable[[str, int, Any
 
 
 def positions(value: float) -> Callable[[Any], None]:
-    return lambda message: message.position.fill(value)
+    return lambda message: setattr(message, "position", np.full(7, value))
 
 
 FAULTS = [
@@ -126,21 +117,18 @@ FAULTS = [
     ("joint_states", positions(57.0), Kind.UNIT, "-6.4..6.4 [rad]", "57, plausible if it is in deg"),
     ("ft/wrench", lambda m: setattr(m.wrench.force, "x", 1e4), Kind.RANGE, "-200..200 [N]", "10000"),
     ("ft/wrench", lambda m: setattr(m.header, "frame_id", "world"), Kind.FRAME, "'ft_sensor'", "'world'"),
-    ("ft/wrench", lambda m: setattr(m.header, "stamp", Time(0, 5)), Kind.STAMP, "at least 1999000000 ns", "5 ns: backwards"),
+    ("ft/wrench", lambda m: setattr(m.header, "stamp", msg.Time(0, 5)), Kind.STAMP, "at least 999000000 ns", "5 ns: backwards"),
 ]
 
 
 @pytest.mark.parametrize(("topic", "change", "kind", "expected", "got"), FAULTS, ids=[str(fault[2]) for fault in FAULTS])
-def test_a_single_bad_message_is_named(topic: str, change: Any, kind: Kind, expected: str, got: str) -> None:
-    bus = Bus()
-    bus.run(2000)
+def test_a_single_bad_message_is_named(bus: Bus, topic: str, change: Any, kind: Kind, expected: str, got: str) -> None:
     bus.run(1, spoiled(topic, change))
     bus.run(LOOK_MS)
     tick, violation = bus.named.pop(f"{topic} {kind}")
     assert (violation.sender, violation.expected, violation.got) == ("robot", expected, got)
-    assert tick <= 2000 + LOOK_MS
+    assert tick <= 1000 + LOOK_MS
     assert bus.named == {}
-    assert str(violation).startswith(f"{topic}")
 
 
 @pytest.mark.parametrize(
@@ -149,29 +137,25 @@ def test_a_single_bad_message_is_named(topic: str, change: Any, kind: Kind, expe
 def test_a_wrong_rate_is_named_within_a_second(counts: tuple[int, int], kind: Kind, got: str) -> None:
     """`counts`: messages at even and odd ticks."""
     bus = Bus(factor=1.0)
-    bus.run(2000)
+    bus.run(1000)
     bus.run(1000, lambda name, t, message: [message] * counts[t // MS % 2] if name == "control/joint_torque" else message)
     tick, violation = bus.named[f"control/joint_torque {kind}"]
     assert violation.sender == "control"
     assert violation.expected.startswith("1000 Hz")
-    assert tick - 2000 <= 1000
+    assert tick <= 2000
     assert got in bus.monitor.active["control/joint_torque", "control", kind, ""].violation.got
     assert not any(name.startswith(("joint_states", "ft/wrench")) for name in bus.named)
 
 
-def test_a_gap_is_counted_and_named() -> None:
-    bus = Bus()
-    bus.run(1000)
+def test_a_gap_is_counted_and_named(bus: Bus) -> None:
     bus.sequences["joint_states"] += 3
     bus.run(LOOK_MS)
     violation = bus.named["joint_states gap"][1]
     assert (violation.expected, violation.got[:13]) == ("sequence 1001", "1004: 3 missi")
-    assert next(row.missing for row in bus.monitor.health() if row.topic.name == "joint_states") == 3
+    assert bus.health("joint_states").missing == 3
 
 
-def test_bytes_that_are_not_a_message_are_named() -> None:
-    bus = Bus()
-    bus.run(1000)
+def test_bytes_that_are_not_a_message_are_named(bus: Bus) -> None:
     bus.run(1, lambda name, t, message: b"\x00\x01\x00\x00" if name == "ft/wrench" else message)
     bus.run(LOOK_MS)
     assert bus.named["ft/wrench garbage"][1].expected == "geometry_msgs/msg/WrenchStamped"
@@ -199,82 +183,74 @@ def test_another_sender_or_type_is_named_from_the_token_alone(
 
 def test_a_topic_that_lags_behind_the_others_is_too_old() -> None:
     bus = Bus(monitor=Monitor(RULES), factor=1.0)
-    late: dict[str, list[Any]] = {"sent": []}
+    late: list[Any] = []
 
     def lag(name: str, t: int, message: Any) -> Any:
         if name != "control/joint_torque":
             return message
-        late["sent"].append(message)
-        return late["sent"].pop(0) if len(late["sent"]) > 300 else None
+        late.append(message)
+        return late.pop(0) if len(late) > 300 else None
 
-    bus.run(2500, lag)
+    bus.run(1500, lag)
     assert bus.named["control/joint_torque age"][1].expected == "at most 20 ms"
 
 
-def test_the_next_run_on_the_same_bus_is_judged_by_itself() -> None:
+def test_the_next_run_on_the_same_bus_is_judged_by_itself(bus: Bus) -> None:
     """Router and monitor outlive a run; messages of the first run are older than those of the second."""
-    bus = Bus()
-    bus.run(3000)
     for generation in (1, 2):
         bus.entities = [entity(RULES.topics[name].producer, name, 10 * generation + i) for i, name in enumerate(MAKE)]
         bus.sequences = dict.fromkeys(MAKE, 0)
         start = bus.tick
-        bus.run(1500, lambda name, t, _, start=start: MAKE[name](t - start * MS))
+        bus.run(1200, lambda name, t, _, start=start: MAKE[name](t - start * MS))
         assert bus.named == {}
         assert bus.monitor.time.progress == pytest.approx(0.5, abs=0.05)
-    assert [row.senders for row in bus.monitor.health() if row.topic.name == "joint_states"] == [("robot",)]
+    assert bus.health("joint_states").senders == ("robot",)
     bus.run(1000, lambda name, t, _: None if name == "joint_states" else MAKE[name](t - start * MS))
     assert [kind for kind in bus.named if "silent" in kind] == ["joint_states silent"]
 
 
-def test_a_sender_that_returns_is_judged_again() -> None:
+def test_a_sender_that_returns_is_judged_again(bus: Bus) -> None:
     """A link that is lost briefly removes all tokens."""
-    bus = Bus()
-    bus.run(1500)
     bus.monitor.set_entities([], bus.factor * bus.tick / 1000)
     bus.run(1500)
     assert bus.named == {}
     assert bus.monitor.time.progress == pytest.approx(0.5, abs=0.05)
 
 
-def test_violations_show_in_diagnostics() -> None:
-    bus = Bus()
-    bus.run(1000)
+def test_violations_show_in_diagnostics(bus: Bus) -> None:
     bus.run(1, spoiled("joint_states", positions(np.nan)))
     bus.run(LOOK_MS)
     now = bus.factor * bus.tick / 1000
-    statuses = topic_statuses(bus.monitor.health(), bus.monitor.active.values(), now)
-    by_name = {status.name: status for status in statuses}
-    bad, good = by_name["palpate/topic/joint_states"], by_name["palpate/topic/ft/wrench"]
-    assert bad.level == DiagnosticStatus.ERROR
-    assert "nan" in bad.message
-    assert bad.hardware_id == "robot"
-    assert good.level == DiagnosticStatus.OK
-    assert by_name["palpate/topic/exam/state"].level == DiagnosticStatus.STALE
-    later = topic_statuses(bus.monitor.health(), bus.monitor.active.values(), now + RECENT_S + 1)
-    over = next(status for status in later if status.name == bad.name)
-    assert over.level == DiagnosticStatus.WARN
-    assert "was" in over.message
-    assert codec.encode(DiagnosticArray(header(7), statuses), "diagnostic_msgs/msg/DiagnosticArray")
+
+    def statuses(at: float) -> dict[str, Any]:
+        found = topic_statuses(bus.monitor.health(), bus.monitor.active.values(), at)
+        return {status.name.removeprefix("palpate/topic/"): status for status in found}
+
+    by_name = statuses(now)
+    bad = by_name["joint_states"]
+    assert (bad.level, bad.hardware_id, "nan" in bad.message) == (msg.DiagnosticStatus.ERROR, "robot", True)
+    assert by_name["ft/wrench"].level == msg.DiagnosticStatus.OK
+    assert by_name["exam/state"].level == msg.DiagnosticStatus.STALE
+    assert statuses(now + RECENT_S + 1)["joint_states"].level == msg.DiagnosticStatus.WARN
+    assert codec.encode(msg.DiagnosticArray(header(7), list(by_name.values())), "diagnostic_msgs/msg/DiagnosticArray")
 
 
 def test_an_intermittent_subscription_causes_no_violation() -> None:
     bus = Bus(factor=1.0)
     for listens in (True, False, True, False):
         bus.monitor.listen(MAKE if listens else MAKE.keys() - {"ft/wrench"}, bus.tick / 1000)
-        bus.run(1500)
-        wrench = next(row for row in bus.monitor.health() if row.topic.name == "ft/wrench")
-        assert wrench.alive
-        assert wrench.bus_rate_hz == pytest.approx(1000, rel=0.05)
+        bus.run(1000)
+        assert bus.health("ft/wrench").alive
+        assert bus.health("ft/wrench").bus_rate_hz == pytest.approx(1000, rel=0.05)
     assert bus.named == {}
 
 
 @pytest.mark.parametrize("name", ["ft/wrench", "sim/link_poses", "planning/setpoint", "sim/surface", "robot/status"])
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_every_number_out_of_range_or_not_finite_is_named(name: str, data: st.DataObject) -> None:
     topic = RULES.topics[name]
-    message = data.draw(messages(topic.type))
+    message = data.draw(drawn(topic.type))
     wrong = set()
     for leaf in leaves(topic.type):
         if leaf.base != "string":
@@ -283,5 +259,4 @@ def test_every_number_out_of_range_or_not_finite_is_named(name: str, data: st.Da
             values = numbers(message, leaf.path)
             if not np.all(np.isfinite(values) & (values >= least) & (values <= most)):
                 wrong.add(row)
-    others = (Kind.FRAME, Kind.NORM)
-    assert {found.field for found in Checker(topic)(message) if found.kind not in others} == wrong
+    assert {found.field for found in Checker(topic)(message) if found.kind not in (Kind.FRAME, Kind.NORM)} == wrong

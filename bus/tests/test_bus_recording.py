@@ -4,14 +4,15 @@ import json
 import signal
 from collections import deque
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from toy_services import joint_state
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.messages import MS, JointState, RunControl, ServiceReport, codec, header
+from palpate_bus.messages import MS, RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
 from palpate_bus.runtime.observer import RecorderNode
 from palpate_bus.runtime.output import ChunkMessage, ChunkWriter, unpack_chunk
@@ -36,7 +37,7 @@ def test_a_chunk_round_trips(sent: list[ChunkMessage]) -> None:
 
 
 PRODUCERS = [name for name, role in contract().roles.items() if not role.observer]
-STATE = codec.encode(JointState(header(0), ["a"], np.zeros(1), np.zeros(1), np.zeros(1)), "sensor_msgs/msg/JointState")
+STATE = codec.encode(joint_state(0), "sensor_msgs/msg/JointState")
 
 
 class Queue:
@@ -47,10 +48,8 @@ class Queue:
         self.waiting = deque(enumerate(payloads, 1))
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
-        if not self.waiting:
-            return None
-        number, payload = self.waiting.popleft()
-        return ReceivedSample(number, 0, payload)
+        number, payload = self.waiting.popleft() if self.waiting else (0, None)
+        return None if payload is None else ReceivedSample(number, 0, payload)
 
 
 class Kept(Service):
@@ -125,51 +124,58 @@ def said(command: int, role: str = "") -> RunControl:
     return RunControl(command, 0, False, role, "")
 
 
-def test_received_messages_are_recorded_and_reported() -> None:
-    kept = Kept()
-    member: Any = Bus(said(RunControl.HELLO), said(RunControl.GRANT), said(RunControl.END))
+HELLO, END, ABORT = (said(command) for command in (RunControl.HELLO, RunControl.END, RunControl.ABORT))
+FIRST = ("joint_states", 7 * MS, 8)
+
+
+@pytest.fixture
+def kept() -> Kept:
+    return Kept()
+
+
+def run(kept: Kept, member: Any) -> Any:
     RecorderNode(kept, member).run()
-    assert kept.messages == [("joint_states", 7 * MS, 8)]
+    return json.loads(member.reports[-1].detail)
+
+
+def test_received_messages_are_recorded_and_reported(kept: Kept) -> None:
+    member = Bus(HELLO, said(RunControl.GRANT), END)
+    detail = run(kept, member)
+    assert kept.messages == [FIRST]
     states = [report.state for report in member.reports if report.state != ServiceReport.PROGRESS]
     assert states == [ServiceReport.READY, ServiceReport.FINISHED]
-    detail = json.loads(member.reports[-1].detail)
     assert (detail["messages"], detail["garbage"], detail["facts"]) == (1, 0, {"kept": 1})
 
 
-def test_a_lost_role_is_not_waited_for() -> None:
-    lost = [said(RunControl.LOST, role) for role in PRODUCERS if role != "robot"]
-    member: Any = Bus(said(RunControl.HELLO), *lost, said(RunControl.END))
-    RecorderNode(Kept(), member).run()
+def test_a_lost_role_is_not_waited_for(kept: Kept) -> None:
+    member = Bus(HELLO, *(said(RunControl.LOST, role) for role in PRODUCERS if role != "robot"), END)
+    run(kept, member)
     assert member.reports[-1].tick == 50 * MS  # tick of the robot, the only remaining role
 
 
-def test_without_conductor_and_services_the_recording_is_completed() -> None:
-    kept = Kept()
-    member: Any = Bus()
-    with pytest.raises(RunAborted, match="token is gone"):
-        RecorderNode(kept, member).run()
-    assert kept.messages == [("joint_states", 7 * MS, 8)]
+def test_without_conductor_and_services_the_recording_is_completed(kept: Kept) -> None:
+    with pytest.raises(RunAborted):
+        run(kept, Bus())
+    assert kept.messages == [FIRST]
 
 
-def test_a_signal_completes_the_recording() -> None:
-    kept = Kept()
-    member: Any = Bus(said(RunControl.HELLO))
+def test_a_signal_completes_the_recording(kept: Kept) -> None:
+    member: Any = Bus(HELLO)
     member.alive = lambda roles: signal.raise_signal(signal.SIGTERM)
     member.conductor_there = False
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            RecorderNode(kept, member).run()
+            run(kept, member)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert kept.finished
-    assert kept.messages == [("joint_states", 7 * MS, 8)]
+    assert kept.messages == [FIRST]
 
 
-@pytest.mark.parametrize("command", [RunControl.END, RunControl.ABORT], ids=["end", "abort"])
-def test_messages_in_transit_at_the_end_are_recorded(command: int) -> None:
-    kept = Kept()
-    member: Any = Bus(said(RunControl.HELLO), said(command))
+@pytest.mark.parametrize("command", [END, ABORT], ids=["end", "abort"])
+def test_messages_in_transit_at_the_end_are_recorded(kept: Kept, command: RunControl) -> None:
+    member: Any = Bus(HELLO, command)
     member.there = deque(["robot", "robot"])
     alive, looks = member.alive, []
 
@@ -180,26 +186,19 @@ def test_messages_in_transit_at_the_end_are_recorded(command: int) -> None:
         return frozenset(alive(roles))
 
     member.alive = sends_once_more
-    node = RecorderNode(kept, member)
-    if command == RunControl.ABORT:
-        with pytest.raises(RunAborted):
-            node.run()
-    else:
-        node.run()
+    with pytest.raises(RunAborted) if command is ABORT else nullcontext():
+        run(kept, member)
     assert [stamp for _, stamp, _ in kept.messages] == [7 * MS, 57 * MS]
     assert kept.finished
 
 
 @pytest.mark.parametrize(
-    "again",
-    [(1, ("joint_states", 7 * MS, 8)), (2, ("joint_states", -1, 9)), (2, ("planning/setpoint", 8 * MS, 9))],
+    ("number", "message"),
+    [(1, FIRST), (2, ("joint_states", -1, 9)), (2, ("planning/setpoint", 8 * MS, 9))],
     ids=["again", "before the start", "another's topic"],
 )
-def test_an_invalid_chunk_is_garbage(again: tuple[int, tuple[str, int, int]]) -> None:
-    kept = Kept()
-    member: Any = Bus(said(RunControl.HELLO), said(RunControl.END))
-    number, message = again
+def test_an_invalid_chunk_is_garbage(kept: Kept, number: int, message: tuple[str, int, int]) -> None:
+    member = Bus(HELLO, END)
     member.chunks.waiting.append((number, chunk(*message)))
-    RecorderNode(kept, member).run()
-    assert kept.messages == [("joint_states", 7 * MS, 8)]
-    assert json.loads(member.reports[-1].detail)["garbage"] == 1
+    assert run(kept, member)["garbage"] == 1
+    assert kept.messages == [FIRST]

@@ -1,14 +1,14 @@
 """Subscriptions and authentication tags."""
 
 import threading
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from time import sleep, time_ns
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hypothesis import given, strategies as st
+from zenoh import ZBytes
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import OperatorRequest, codec, header
@@ -57,34 +57,12 @@ def test_a_key_is_readable_to_its_owner_only(tmp_path: Path) -> None:
 
 
 def test_messages_that_move_the_arm_or_conduct_are_tagged() -> None:
-    for name in (
-        "control/joint_torque",
-        "planning/setpoint",
-        "supervisor/state",
-        "palpate/control",
-        "palpate/report/robot",
-        "operator/request",
-    ):
-        assert contract().tagged(name)
-    assert not contract().tagged("palpate/record/robot")
-    assert not contract().tagged("nothing")
+    moving = ("control/joint_torque", "planning/setpoint", "supervisor/state", "operator/request")
+    assert all(contract().tagged(name) for name in (*moving, "palpate/control", "palpate/report/robot"))
+    assert not any(contract().tagged(name) for name in ("palpate/record/robot", "nothing"))
 
 
 OURS, STRANGER = b"o" * 16, b"s" * 16
-
-
-@dataclass
-class Bytes:
-    held: bytes
-
-    def to_bytes(self) -> bytes:
-        return self.held
-
-
-@dataclass
-class Sample:
-    attachment: Bytes
-    payload: Bytes
 
 
 class Wire:
@@ -100,7 +78,8 @@ class Wire:
         return object()
 
     def bring(self, gid: bytes, sequence: int, payload: bytes = b"data") -> None:
-        sample: Any = Sample(Bytes(AttachmentWriter(gid).pack(sequence, 0)), Bytes(payload))
+        attachment = AttachmentWriter(gid).pack(sequence, 0)
+        sample: Any = SimpleNamespace(attachment=ZBytes(attachment), payload=ZBytes(payload))
         self.subscription._queue.put(sample)
 
     def numbers(self) -> list[int]:
@@ -108,8 +87,8 @@ class Wire:
 
 
 @pytest.fixture
-def wire(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
-    yield Wire(monkeypatch)
+def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
+    return Wire(monkeypatch)
 
 
 def test_the_sender_of_the_hello_replaces_an_earlier_one(wire: Wire) -> None:

@@ -8,18 +8,8 @@ from hypothesis import given, strategies as st
 from waiting import wait_until
 
 from palpate_bus.contract import contract
-from palpate_bus.wire import rmw as wire
-from palpate_bus.wire.liveliness import (
-    Endpoint,
-    Entity,
-    EntityKind,
-    GraphWatch,
-    NodeTokens,
-    gid,
-    mismatches,
-    parse_token,
-    qos_token,
-)
+from palpate_bus.wire import liveliness, rmw as wire
+from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, GraphWatch, NodeTokens, parse_token
 from palpate_bus.wire.zenoh_config import mesh, session
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
@@ -94,13 +84,13 @@ def test_tokens_of_the_design_document() -> None:
     assert talker.endpoint is not None
     assert (talker.endpoint.topic, talker.endpoint.type) == ("chatter", "std_msgs/msg/String")
     qos = RULES.qos["control"].model_copy(update={"depth": 7})
-    assert qos_token(qos) == talker.endpoint.qos
+    assert liveliness.qos_token(qos) == talker.endpoint.qos
 
 
 def test_gid_is_xxh3_of_the_token_low_half_first() -> None:
     # XXH3-128 of the empty string is 99aa06d3014798d86001c324468d497f (high half first), xxHash's own sanity value.
-    assert gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
-    assert parse_token(TALKER).gid == gid(TALKER) != parse_token(LISTENER).gid
+    assert liveliness.gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
+    assert parse_token(TALKER).gid == liveliness.gid(TALKER) != parse_token(LISTENER).gid
 
 
 def test_a_different_definition_is_named_with_both_sides() -> None:
@@ -108,8 +98,8 @@ def test_a_different_definition_is_named_with_both_sides() -> None:
         return Entity(0, "a", 0, 1, kind, node, endpoint=Endpoint("ft/wrench", "geometry_msgs/msg/WrenchStamped", type_hash, ""))
 
     same = [entity(EntityKind.PUBLISHER, "robot", "RIHS01_1"), entity(EntityKind.SUBSCRIPTION, "planning", "RIHS01_1")]
-    assert mismatches(same) == []
-    (sentence,) = mismatches([*same, entity(EntityKind.SUBSCRIPTION, "viewer", "RIHS01_2")])
+    assert liveliness.mismatches(same) == []
+    (sentence,) = liveliness.mismatches([*same, entity(EntityKind.SUBSCRIPTION, "viewer", "RIHS01_2")])
     for part in ("ft/wrench", "robot", "viewer", "RIHS01_1", "RIHS01_2"):
         assert part in sentence
 

@@ -20,22 +20,21 @@ DEADLINE_S = contract().internal[HEARTBEAT].deadline / 1e9
 
 @dataclass
 class Queue:
-    waiting: deque[bytes] = field(default_factory=deque)
+    waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
     garbage: int = 0
-    given: int = 0
-    """Number of the last message; a replayed message repeats it."""
-    latest: bytes = b""
+    latest: tuple[int, bytes] = (0, b"")
+    """The last message with its number; a replayed one repeats it."""
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
-        if not self.waiting:
-            return None
-        payload = self.waiting.popleft()
-        self.given += bool(payload)
-        self.latest = payload or self.latest
-        return ReceivedSample(self.given, 0, self.latest)
+        number, payload = self.waiting.popleft() if self.waiting else (0, b"")
+        return ReceivedSample(number, 0, payload) if payload else None
+
+    def put(self, payload: bytes) -> None:
+        self.latest = (self.latest[0] + 1, payload)
+        self.waiting.append(self.latest)
 
     def replay(self) -> None:
-        self.waiting.append(b"")
+        self.waiting.append(self.latest)
 
 
 class Bus:
@@ -64,7 +63,7 @@ class Bus:
     def say(self, command: int) -> None:
         name = HEARTBEAT if command == RunControl.HEARTBEAT else "palpate/control"
         message = RunControl(command, PID, False, "", pid_space())
-        self.queues[name].waiting.append(codec.encode(message, CONTROL_TYPE))
+        self.queues[name].put(codec.encode(message, CONTROL_TYPE))
 
     def link(self, grace_s: float = 0.0) -> ConductorLink:
         """Return a link that has received the start and a heartbeat."""
@@ -109,13 +108,6 @@ def test_silence_is_noticed_later_in_lockstep_and_while_the_process_runs_without
     assert limit_s < bus.silence(bus.link(grace_s=9.0), 60.0) <= limit_s + 0.1
 
 
-def test_a_conductor_with_a_heartbeat_is_not_lost(wallclock: Bus) -> None:
-    link = wallclock.link()
-    for _ in range(1000):
-        wallclock.say(RunControl.HEARTBEAT)
-        assert wallclock.silence(link, 0.2) == float("inf")
-
-
 def test_a_service_that_was_itself_kept_from_a_core_does_not_blame_the_conductor(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=9.0)
     assert wallclock.silence(link, 0.9, step_s=0.45) == float("inf")
@@ -132,7 +124,7 @@ def test_services_leave_after_the_grace_period(wallclock: Bus) -> None:
     assert wallclock.silence(link, 1.0) < 1.0
     lost_at = wallclock.now
     with pytest.raises(RunAborted, match="no heartbeat for"):
-        while True:
+        for _ in range(1000):
             wallclock.now += STEP_S
             link.poll()
     assert 2.0 <= wallclock.now - lost_at < 2.1
@@ -156,12 +148,10 @@ def test_a_conductor_without_a_heartbeat_has_the_limit_of_a_start(wallclock: Bus
 
 def test_a_replayed_heartbeat_is_ignored(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=9.0)
-    begin = wallclock.now
-    while not link.lost and wallclock.now - begin < 1.0:
+    for _ in range(30):
         wallclock.queues[HEARTBEAT].replay()
-        wallclock.now += STEP_S
-        link.poll()
-    assert wallclock.now - begin < 0.3
+        wallclock.silence(link, STEP_S)
+    assert link.lost
 
 
 def test_a_replayed_control_message_is_ignored(wallclock: Bus) -> None:

@@ -14,33 +14,8 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from palpate_bus.messages import (
-    MS,
-    NS,
-    CameraTrigger,
-    Image,
-    ImpedanceSetpoint,
-    IndentationTruth,
-    JointState,
-    JointTorqueCommand,
-    PalpationSample,
-    PatientTruth,
-    PhantomTruth,
-    Point,
-    Pose,
-    Quaternion,
-    String,
-    SupervisorState,
-    TFMessage,
-    ToolState,
-    Twist,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-    blank,
-    duration_message,
-    header,
-)
+from palpate_bus import messages as msg
+from palpate_bus.messages import MS, NS, blank, header
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
@@ -48,21 +23,29 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions
 
-EXAM, STATUS = blank("palpation_msgs/msg/ExamState"), blank("palpation_msgs/msg/RobotStatus")
-NAMES = [f"lbr_A{i}" for i in range(1, 8)]
+EXAM, STATUS, SAMPLE = (blank(f"palpation_msgs/msg/{name}") for name in ("ExamState", "RobotStatus", "PalpationSample"))
+NAMES, ZEROS = [f"lbr_A{i}" for i in range(1, 8)], np.zeros(7)
 END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
 
 
 def pose(x: float = 0.0) -> Any:
-    return Pose(Point(x, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
+    return msg.Pose(msg.Point(x, 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
 
 
 def twist() -> Any:
-    return Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    return msg.Twist(msg.Vector3(0.0, 0.0, 0.0), msg.Vector3(0.0, 0.0, 0.0))
 
 
 def wrench(x: float = 0.0) -> Any:
-    return Wrench(Vector3(x, 0.0, 0.0), Vector3(0.01 * x, 0.0, 0.0))
+    return msg.Wrench(msg.Vector3(x, 0.0, 0.0), msg.Vector3(0.01 * x, 0.0, 0.0))
+
+
+def joint_state(t: int, x: Any = ZEROS, frame: str = "") -> Any:
+    return msg.JointState(header(t, frame), NAMES, x, x, x)
+
+
+def torque_command(t: int, torque: Any = ZEROS, problem: str = "") -> Any:
+    return msg.JointTorqueCommand(header(t), torque, np.zeros(0), msg.duration_message(50 * MS), problem, "")
 
 
 def misbehave(how: str) -> None:
@@ -89,7 +72,7 @@ class Robot(Service):
     role = "robot"
 
     def start(self) -> Outbox:
-        return {"robot_description": String("<robot/>")}
+        return {"robot_description": msg.String("<robot/>")}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         torque, contact = inbox.latest("control/joint_torque"), inbox.latest("sim/contact_wrench")
@@ -97,20 +80,17 @@ class Robot(Service):
         x = np.full(7, 1e-3 * moved + 1e-12 * t)  # within the contract's rates, and never the same
         h = header(t, "world")
         out: dict[str, Any] = {
-            "joint_states": JointState(h, NAMES, x, x, x),
-            "sim/tool_state": ToolState(h, pose(x[0]), twist(), 0.015),
-            "ft/wrench": WrenchStamped(header(t, "ft_sensor"), wrench(1e-9 * t)),
+            "joint_states": joint_state(t, x, "world"),
+            "sim/tool_state": msg.ToolState(h, pose(x[0]), twist(), 0.015),
+            "ft/wrench": msg.WrenchStamped(header(t, "ft_sensor"), wrench(1e-9 * t)),
         }
         if t % (10 * MS) == 0:
-            out["robot/status"] = _status(h, x, t, inbox.lost("control"))
+            joints = dict.fromkeys(("applied_torque", "measured_torque", "position", "velocity"), x)
+            mode = 2 if inbox.lost("control") else 1
+            out["robot/status"] = replace(STATUS, header=h, mode=mode, wrench=wrench(1e-9 * t), **joints)
         if t % (50 * MS) == 0:
-            out["sim/link_poses"] = TFMessage([])
+            out["sim/link_poses"] = msg.TFMessage([])
         return out
-
-
-def _status(h: Any, x: Any, t: int, lost: bool) -> Any:
-    joints = dict.fromkeys(("applied_torque", "measured_torque", "position", "velocity"), x)
-    return replace(STATUS, header=h, mode=2 if lost else 1, wrench=wrench(1e-9 * t), **joints)
 
 
 class Control(Service):
@@ -125,7 +105,7 @@ class Control(Service):
                 pass
         joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")
         torque = np.sin(1.1 * joints.position + 1e-9 * t + (setpoint.joint_position if setpoint else 0.0))
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, np.zeros(0), duration_message(50 * MS), "", "")}
+        return {"control/joint_torque": torque_command(t, torque)}
 
 
 class Tissue(Service):
@@ -133,7 +113,7 @@ class Tissue(Service):
 
     def start(self) -> Outbox:
         mesh = mesh_message(header(0, "abdomen"), np.zeros(3))
-        return {"truth/phantom": PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
+        return {"truth/phantom": msg.PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         if t == 500 * MS and "TOY_TISSUE_DOES" in os.environ:
@@ -141,11 +121,11 @@ class Tissue(Service):
         h = header(t, "world")
         tool = inbox.latest("sim/tool_state")  # in wall-clock mode a service may step before the first message
         x = 1.0 if tool is None else float(np.cos(tool.pose.position.x))
-        out: dict[str, Any] = {"sim/contact_wrench": WrenchStamped(h, wrench(x))}
+        out: dict[str, Any] = {"sim/contact_wrench": msg.WrenchStamped(h, wrench(x))}
         if t % (10 * MS) == 0:
-            out["truth/indentation"] = IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
+            out["truth/indentation"] = msg.IndentationTruth(h, 0.0, 0.0, 0.0, 0.0, 0, msg.Point(0.0, 0.0, 0.0), 0.0)
         if t % (50 * MS) == 0:
-            out["truth/patient"] = PatientTruth(h, 0.0, pose())
+            out["truth/patient"] = msg.PatientTruth(h, 0.0, pose())
             out["sim/surface"] = mesh_message(h, np.full(9000, x), triangles=np.zeros(18000))
         return out
 
@@ -158,18 +138,17 @@ class Planning(Service):
             time.sleep(float(os.environ["TOY_SLEEP_S"]))
         h = header(t, "world")
         status = inbox.latest("robot/status")
-        q = 0.1 * status.applied_torque if status else np.zeros(7)
+        q = 0.1 * status.applied_torque if status else ZEROS
         watch = inbox.latest("supervisor/state")
         q = q + (watch.depth if watch else 0.0)
         end = END if t >= END - NS else -1
+        six, valid = ZEROS[1:], msg.duration_message(250 * MS)
         out: dict[str, Any] = {
-            "planning/setpoint": ImpedanceSetpoint(
-                h, 0, pose(), twist(), wrench(), np.zeros(6), np.zeros(6), q, np.zeros(7), np.zeros(7), duration_message(250 * MS)
-            ),
-            "exam/state": replace(EXAM, header=h, end_tick=end, surface_normal=Vector3(0.0, 0.0, 1.0)),
+            "planning/setpoint": msg.ImpedanceSetpoint(h, 0, pose(), twist(), wrench(), six, six, q, ZEROS, ZEROS, valid),
+            "exam/state": replace(EXAM, header=h, end_tick=end, surface_normal=msg.Vector3(0.0, 0.0, 1.0)),
         }
         if t % (500 * MS) == 0:
-            out["planning/camera_trigger"] = CameraTrigger(h, 3)
+            out["planning/camera_trigger"] = msg.CameraTrigger(h, 3)
         return out
 
 
@@ -179,10 +158,7 @@ class Assessment(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         if inbox.latest("exam/state") is None or t % (50 * MS):
             return {}
-        sample = PalpationSample(
-            header(t, "abdomen"), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False, 0, 0.0
-        )
-        return {"assessment/samples": [sample, sample]}
+        return {"assessment/samples": [replace(SAMPLE, header=header(t, "abdomen"))] * 2}
 
 
 class Camera(Service):
@@ -192,7 +168,7 @@ class Camera(Service):
         self.frames = 0
 
     def start(self) -> Outbox:
-        return {"tf_static": TFMessage([])}
+        return {"tf_static": msg.TFMessage([])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         self.frames += sum(message.frames for message in inbox.new("planning/camera_trigger"))
@@ -200,7 +176,7 @@ class Camera(Service):
             return {}
         self.frames -= 1
         data = np.full(640 * 480 * 4, self.frames, np.uint8)
-        return {"camera/depth/image_raw": Image(header(t, "camera_depth_optical_frame"), 480, 640, "32FC1", 0, 2560, data)}
+        return {"camera/depth/image_raw": msg.Image(header(t, "camera_depth_optical_frame"), 480, 640, "32FC1", 0, 2560, data)}
 
 
 class Perception(Service):
@@ -219,7 +195,7 @@ class Supervisor(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         depth = min(0.1, abs(float(inbox.latest("robot/status").position[0])))
-        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0, "", 0.0)}
+        return {"supervisor/state": msg.SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0, "", 0.0)}
 
 
 EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)

@@ -3,53 +3,37 @@
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from conductor_messages import collected, result
+from toy_runs import toy_services
 
 from palpate_benchmarks.campaign import draw_cases, judge, prepare, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch, examination
 from palpate_bus.contract import contract
-from palpate_bus.messages import NS, ExamState, JointTorqueCommand, codec, duration_message, header, nanoseconds
+from palpate_bus.messages import NS, ExamState, codec, nanoseconds
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_conductor.outcome import RunProgress
-from palpate_models.scenario.load import ScenarioError
 
 TOPIC = contract().topics["control/joint_torque"]
 
 
-class Sent:
-    def __init__(self) -> None:
-        self.messages: list[tuple[int, bytes]] = []
-
-    def put(self, payload: bytes, sequence: int) -> None:
-        self.messages.append((sequence, payload))
-
-    def hello(self) -> None:
-        self.messages.append((0, b""))
-
-    def close(self) -> None:
-        pass
-
-
-def payload() -> bytes:
-    message = JointTorqueCommand(header(7_000_000_000_000), np.arange(7.0), np.zeros(0), duration_message(50_000_000), "", "")
-    return codec.encode(message, TOPIC.type)
-
-
 def sent(kind: str, count: int = 1, messages: int = 5) -> list[tuple[int, bytes]]:
-    out = Sent()
-    sender = FaultySender(out, TOPIC, InjectedFault(TOPIC.name, kind, count, at=2_000_000), lambda: False)
+    out: list[tuple[int, bytes]] = []
+    to: Any = SimpleNamespace(put=lambda payload, sequence: out.append((sequence, payload)))
+    sender = FaultySender(to, TOPIC, InjectedFault(TOPIC.name, kind, count, at=2_000_000), lambda: False)
+    payload = codec.encode(toy_services.torque_command(7_000_000_000_000, np.arange(7.0)), TOPIC.type)
     for sequence in range(1, messages + 1):
-        sender.put(payload(), sequence)
-    return out.messages
+        sender.put(payload, sequence)
+    return out
 
 
 def test_a_fault_begins_at_its_time_and_hits_its_number_of_messages() -> None:
@@ -69,10 +53,9 @@ def test_a_transport_is_faulty_in_its_topic_only_and_from_the_signal_on() -> Non
     qos = contract().qos["control"]
     with session(BusOptions()) as opened:
         transport = FaultyTransport(opened, InjectedFault(TOPIC.name, "nan", at=0))
-        assert isinstance(transport.publisher(TOPIC.name, topic_key(TOPIC, 0), qos, bytes(16)), FaultySender)
-        assert not isinstance(
-            transport.publisher("joint_states", topic_key(contract().topics["joint_states"], 0), qos, bytes(16)), FaultySender
-        )
+        for topic in (TOPIC, contract().topics["joint_states"]):
+            publisher = transport.publisher(topic.name, topic_key(topic, 0), qos, bytes(16))
+            assert isinstance(publisher, FaultySender) == (topic is TOPIC)
         late = FaultyTransport(opened, InjectedFault("clock", "jump"))
         before = late.now()
         assert before < late.now() < before + NS
@@ -141,13 +124,10 @@ def test_an_end_that_names_no_role_is_bad(tmp_path: Path) -> None:
     assert not judged(watch().finish(failed), tmp_path, "nan", "planning/setpoint").passed
 
 
-def test_results_are_read_back_from_their_file() -> None:
+def test_results_are_read_back_from_their_file_and_from_no_other() -> None:
     killed = CaseResult("kill", "robot", "lockstep", 8.0, 33.2, 'robot, "gone"\nat once', "run ended", 5.0, named=True)
     hung = CaseResult("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False)
     assert from_csv(csv_text([killed, hung])) == [killed, hung]
-
-
-def test_a_file_of_other_columns_is_refused() -> None:
     with pytest.raises(ValueError, match="must have the columns kind, target"):
         from_csv("mode,fault\nlockstep,kill\n")
 
@@ -164,15 +144,9 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
     good = CaseResult("kill", "x", "lockstep", 8.0, peak_force_before_n=5.0, peak_force_n=6.9, ended="x lost", named=True)
     assert good.passed
     assert replace(good, peak_force_before_n=0.0, peak_force_n=14.0).passed, "before contact the force has yet to rise"
-    for bad in (
-        replace(good, peak_force_n=7.1),
-        replace(good, peak_force_before_n=14.0, peak_force_n=15.5),
-        replace(good, kept=False),
-        replace(good, left_behind="/somewhere"),
-        replace(good, named=False),
-        replace(good, hung=True),
-    ):
-        assert not bad.passed
+    higher, over = {"peak_force_n": 7.1}, {"peak_force_before_n": 14.0, "peak_force_n": 15.5}
+    for bad in (higher, over, {"kept": False}, {"left_behind": "/somewhere"}, {"named": False}, {"hung": True}):
+        assert not replace(good, **bad).passed
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -194,8 +168,6 @@ def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None
 
 def test_settings_change_the_examination_of_the_cases() -> None:
     assert examination(("exam.depth_m=0.006",)).exam.depth_m == 0.006
-    with pytest.raises(ScenarioError, match=r"exam\.depth"):
-        examination(("exam.depth=0.006",))
 
 
 @pytest.mark.slow

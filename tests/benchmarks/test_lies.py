@@ -23,10 +23,8 @@ MOMENT = 5 * MS
 
 def sent(lie: str, ticks: int = 12) -> list[Any]:
     topic = lie.split(maxsplit=1)[0]
-    service, inbox = (
-        Liar(toy_services.Robot(), Lie.parse(f"{lie} {MOMENT / NS}")),
-        Stepper(toy_services.Robot(), contract()).inbox,
-    )
+    service = Liar(toy_services.Robot(), Lie.parse(f"{lie} {MOMENT / NS}"))
+    inbox = Stepper(toy_services.Robot(), contract()).inbox
     return [dict(service.step(t * MS, inbox))[topic] for t in range(ticks)]
 
 
@@ -55,11 +53,9 @@ def test_messages_come_late_twice_and_out_of_order() -> None:
 
 def test_joints_and_quaternions_change_places() -> None:
     assert sent("sim/tool_state pose.orientation swapped 0")[10].pose.orientation.x == 1.0
-    joints = sent("joint_states position bias 0.5")[10]
-    assert joints.position == pytest.approx(np.full(7, 0.5), abs=1e-3)
-    assert np.array_equal(
-        sent("joint_states position permuted 0")[10].velocity, sent("joint_states position permuted 0")[10].effort
-    )
+    assert sent("joint_states position bias 0.5")[10].position == pytest.approx(np.full(7, 0.5), abs=1e-3)
+    joints = sent("joint_states position permuted 0")[10]
+    assert np.array_equal(joints.velocity, joints.effort)
 
 
 def test_every_topic_that_a_service_reads_has_cases_or_a_reason() -> None:

@@ -81,20 +81,14 @@ def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
 def test_the_page_is_made_of_runs(tmp_path: Path) -> None:
     small = [w for s in ("exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=6") for w in ("--set", s)]
     palpate = str(Path(sys.executable).with_name("palpate"))
-    done = subprocess.run(
-        [palpate, "reproduce", "--out", str(tmp_path), "--json", *small],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=1700,
-    )
+    words = [palpate, "reproduce", "--out", str(tmp_path), "--json", *small]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=1700)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["factor"] > 1.5  # points take longer
     assert facts["nodes"] >= 10
     page = (tmp_path / "reproduction.md").read_text(encoding="utf-8")
-    for number in (3, 5, 6, 7, 8):
-        assert f"## Figure {number}" in page
+    assert all(f"## Figure {number}" in page for number in (3, 5, 6, 7, 8))
     images = sorted((tmp_path / "images" / "reproduction").glob("*.png"))
     assert len(images) == 6
     assert all(image.stat().st_size < 400_000 for image in images)

@@ -63,13 +63,8 @@ def main():
     counts = dict.fromkeys(options.topics, 0)
     with zenoh.open(config) as session:
         for topic in options.topics:
-            # A named function binds the topic; zenoh calls it from its own thread, so it only hands over.
-            def put(sample, topic=topic):
-                queue.put((topic, sample))
-
-            session.declare_subscriber(
-                key(store, topic, TOPICS[topic], options.domain), zenoh.handlers.Callback(put, indirect=False)
-            )
+            handler = zenoh.handlers.Callback(lambda sample, topic=topic: queue.put((topic, sample)), indirect=False)
+            session.declare_subscriber(key(store, topic, TOPICS[topic], options.domain), handler)
         print("listening", flush=True)
         end = time.monotonic() + options.seconds
         while min(counts.values()) < options.count and time.monotonic() < end:

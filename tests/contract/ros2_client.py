@@ -14,31 +14,16 @@ import sys
 import threading
 import time
 
-from zenoh_ros2_sdk import (
-    ROS2Publisher,
-    ROS2Subscriber,
-    ZenohSession,
-    get_message_class,
-    get_registry,
-    get_topic_info,
-    get_topic_names_and_types,
-)
+import zenoh_ros2_sdk as ros2
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, ZenohSession, get_message_class
 
 TOPICS = {
-    "/joint_states": "sensor_msgs/msg/JointState",
-    "/ft/wrench": "geometry_msgs/msg/WrenchStamped",
-    "/camera/depth/image_raw": "sensor_msgs/msg/Image",
+    "/joint_states": ("sensor_msgs/msg/JointState", lambda message: {"names": list(message.name)}),
+    "/ft/wrench": ("geometry_msgs/msg/WrenchStamped", lambda message: {"frame": message.header.frame_id}),
+    "/camera/depth/image_raw": ("sensor_msgs/msg/Image", lambda message: {"size": [message.height, message.width]}),
 }
+"""Type of each topic, and what is printed of its first message."""
 SAFE_HOLD, STOP_REQUESTED, STOP = 2, 8, 0
-
-
-def summary(topic, message):
-    if topic == "/joint_states":
-        return {"names": list(message.name), "position": [float(x) for x in message.position]}
-    if topic == "/ft/wrench":
-        force = message.wrench.force
-        return {"frame": message.header.frame_id, "force": [force.x, force.y, force.z]}
-    return {"frame": message.header.frame_id, "size": [message.height, message.width], "encoding": message.encoding}
 
 
 def main():
@@ -51,18 +36,18 @@ def main():
     logging.basicConfig(level=logging.WARNING)
     where = {"domain_id": options.domain, "router_port": options.port}
     ZenohSession.get_instance("127.0.0.1", options.port)
-    get_registry(options.definitions)
+    ros2.get_registry(options.definitions)
     end = time.monotonic() + options.seconds
     lock = threading.Lock()
-    received = {}
+    received = set()
     held = threading.Event()
 
-    def receive(topic):
+    def receive(topic, summary):
         def callback(message):
             with lock:
                 if topic not in received:
-                    received[topic] = summary(topic, message)
-                    print(json.dumps({"received": topic, **received[topic]}), flush=True)
+                    received.add(topic)
+                    print(json.dumps({"received": topic, **summary(message)}), flush=True)
 
         return callback
 
@@ -72,13 +57,13 @@ def main():
                 print(json.dumps({"robot": message.reason}), flush=True)
             held.set()
 
-    subscribers = [ROS2Subscriber(topic, kind, receive(topic), **where) for topic, kind in TOPICS.items()]
+    subscribers = [ROS2Subscriber(topic, kind, receive(topic, of), **where) for topic, (kind, of) in TOPICS.items()]
     subscribers.append(ROS2Subscriber("/robot/status", "palpation_msgs/msg/RobotStatus", watch, **where))
     print(json.dumps({"listening": sorted(TOPICS)}), flush=True)
     while len(received) < len(TOPICS) and time.monotonic() < end:
         time.sleep(0.1)
-    names = dict(get_topic_names_and_types(domain_id=options.domain, router_port=options.port, timeout=2.0))
-    info = get_topic_info("/joint_states", domain_id=options.domain, router_port=options.port, timeout=2.0, verbose=True)
+    names = dict(ros2.get_topic_names_and_types(domain_id=options.domain, router_port=options.port, timeout=2.0))
+    info = ros2.get_topic_info("/joint_states", domain_id=options.domain, router_port=options.port, timeout=2.0, verbose=True)
     print(json.dumps({"topics": sorted(names), "publishers": sorted({p.node_name for p in info.publishers})}), flush=True)
 
     kind = "palpation_msgs/msg/OperatorRequest"

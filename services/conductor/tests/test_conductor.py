@@ -4,12 +4,14 @@ import json
 import re
 import subprocess
 import sys
-import tempfile
+from collections.abc import Iterator
 from time import sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
+import zenoh
 
 from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
@@ -63,25 +65,27 @@ def test_an_examination_that_is_over_ends_the_run_even_if_planning_announces_no_
     assert Collected([exam_state(50, phase, end_tick=announced)]).end_tick == end
 
 
-def test_a_pause_has_a_bound_and_is_named() -> None:
-    with tempfile.TemporaryDirectory(prefix="pause-") as folder:
-        session = open_session(BusOptions(listen=(f"unixsock-stream/{folder}/conductor",)))
-        try:
-            conductor = Conductor(session, contract(), 0, ("control",), Collector(), Patience(pause=0.3))
-            conductor.grants.begin()
-            conductor.grants.pace("pause", 0)
-            conductor._extend_grant()
-            assert any("palpate resume" in text for text in conductor.result.trouble)
-            sleep(0.2)
-            conductor.grants.pace("pause", 0)  # counts on
-            sleep(0.2)
-            with pytest.raises(RunFailed) as failed:
-                conductor._extend_grant()
-            assert failed.value.failure.code is FailureCode.STOPPED
-            conductor.grants.pace("resume", 0)
-            conductor._extend_grant()
-        finally:
-            close_session(session)
+@pytest.fixture
+def session() -> Iterator[zenoh.Session]:
+    opened = open_session(BusOptions())
+    yield opened
+    close_session(opened)
+
+
+def test_a_pause_has_a_bound_and_is_named(session: zenoh.Session) -> None:
+    conductor = Conductor(session, contract(), 0, ("control",), Collector(), Patience(pause=0.3))
+    conductor.grants.begin()
+    conductor.grants.pace("pause", 0)
+    conductor._extend_grant()
+    assert any("palpate resume" in text for text in conductor.result.trouble)
+    sleep(0.2)
+    conductor.grants.pace("pause", 0)  # counts on
+    sleep(0.2)
+    with pytest.raises(RunFailed) as failed:
+        conductor._extend_grant()
+    assert failed.value.failure.code is FailureCode.STOPPED
+    conductor.grants.pace("resume", 0)
+    conductor._extend_grant()
 
 
 @pytest.mark.parametrize("wallclock", [True, False])
@@ -140,21 +144,17 @@ def test_a_process_without_a_connection_is_distinguished_from_one_that_exited() 
 
 @pytest.mark.parametrize(("wallclock", "beats", "stood_still_s"), [(True, False, 0.4), (False, False, 0.0), (True, True, 0.0)])
 def test_a_standstill_is_longer_than_the_services_wait_and_stops_the_heartbeat(
-    monkeypatch: pytest.MonkeyPatch, wallclock: bool, beats: bool, stood_still_s: float
+    session: zenoh.Session, monkeypatch: pytest.MonkeyPatch, wallclock: bool, beats: bool, stood_still_s: float
 ) -> None:
-    session = open_session(BusOptions())
     now = 100.0
     monkeypatch.setattr("palpate_conductor.watchdog.monotonic", lambda: now)
-    try:
-        beat = Heartbeat(Member(session, "conductor", contract(), 0), contract(), wallclock)
-        beat.loop_turned()
-        now += 0.4
-        if beats:
-            beat._sent_at = now - 0.1
-        beat.loop_turned()
-        assert beat.stood_still_s == pytest.approx(stood_still_s)
-    finally:
-        close_session(session)
+    beat = Heartbeat(Member(session, "conductor", contract(), 0), contract(), wallclock)
+    beat.loop_turned()
+    now += 0.4
+    if beats:
+        beat._sent_at = now - 0.1
+    beat.loop_turned()
+    assert beat.stood_still_s == pytest.approx(stood_still_s)
 
 
 # -- the operator
@@ -165,10 +165,9 @@ class Query:
 
     def __init__(self, word: str, ms: int = 0, text: str = "", key: bytes | None = None) -> None:
         text = text or json.dumps({"word": word, "reason": "test", "ms": ms, "sent": time_ns()})
-        self.payload = SimpleNamespace(to_bytes=text.encode)
         tag = b"" if key is None else Tagger(key, "0/palpate/operator").tag(b"", text.encode())
-        self.attachment = SimpleNamespace(to_bytes=lambda: tag)
-        self.answer: dict[str, Any] | None = None
+        self.payload, self.attachment = zenoh.ZBytes(text), zenoh.ZBytes(tag)
+        self.answer: dict[str, Any] = {}
 
     def reply(self, key: str, text: str) -> None:
         self.answer = json.loads(text)
@@ -177,81 +176,72 @@ class Query:
         """Do nothing."""
 
 
-class Session:
-    """A session without a bus."""
+class Operated:
+    """The conductor's side of the operator, without a bus; all that it does is in `done`."""
 
-    def declare_queryable(self, key: str, handler: Any) -> Any:
-        return SimpleNamespace(undeclare=lambda: None)
+    def __init__(self, pace: Any = None, key: bytes | None = None) -> None:
+        session: Any = SimpleNamespace(declare_queryable=lambda key, handler: None)
+        self.done: list[object] = []
+        self.server = OperatorRequestServer(
+            session, 0, lambda *sent: self.done.append(sent), pace or (lambda *asked: str(self.done.append(asked))), key
+        )
+
+    def poll(self, query: Query, *states: Any) -> tuple[Any, Any]:
+        """Send the query in the first state; return what it is answered in the last."""
+        self.done.clear()
+        self.server._asked.put(query)
+        for state in states or (None,):
+            assert not query.answer, "an earlier state confirms nothing"
+            self.server.poll(state)
+        return query.answer.get("done"), query.answer.get("words")
 
 
 def state(level: int, reason: str, releases: int = 0, refusals: int = 0) -> Any:
     return SupervisorState(header(0), level, 1, reason, releases, 0.0, -1.0, 0.0, refusals, "", 0.0)
 
 
-def never(word: str, ms: int) -> str:
-    raise UserError("wall-clock run")
+REFUSED = state(2, "release refused: 45 N", refusals=1)
 
 
-def asked(word: str, before: Any, after: Any) -> tuple[bool, str]:
-    sent: list[int] = []
-    server = OperatorRequestServer(Session(), 0, lambda request, reason: sent.append(request), never)  # type: ignore[arg-type]
-    query = Query(word)
-    server._asked.put(query)
-    server.poll(before)
-    assert sent
-    assert query.answer is None, "an earlier state confirms nothing"
-    server.poll(after)
-    assert query.answer is not None
-    return query.answer["done"], query.answer["words"]
-
-
-def test_a_release_is_not_answered_with_an_earlier_refusal() -> None:
-    refused = state(2, "release refused: 45 N", refusals=1)
-    assert asked("release", refused, state(0, "", releases=1, refusals=1)) == (True, "released")
-
-
-def test_a_refusal_gives_the_reason() -> None:
-    assert asked("release", state(2, "45 N"), state(2, "release refused: 45 N", refusals=1)) == (False, "release refused: 45 N")
+@pytest.mark.parametrize(
+    ("before", "after", "answer"),
+    [
+        (REFUSED, state(0, "", releases=1, refusals=1), (True, "released")),
+        (state(2, "45 N"), REFUSED, (False, "release refused: 45 N")),
+    ],
+)
+def test_a_release_is_answered_by_the_next_state(before: Any, after: Any, answer: tuple[bool, str]) -> None:
+    operated = Operated()
+    assert operated.poll(Query("release"), before, after) == answer
+    assert operated.done
 
 
 def test_the_conductor_answers_requests_about_time() -> None:
-    for pace, answer in ((lambda word, ms: f"{word} {ms}", (True, "step 3")), (never, (False, "wall-clock run"))):
-        server = OperatorRequestServer(Session(), 0, lambda request, reason: None, pace)  # type: ignore[arg-type]
-        query = Query("step", 3)
-        server._asked.put(query)
-        server.poll(None)
-        assert query.answer is not None
-        assert (query.answer["done"], query.answer["words"]) == answer
+    assert Operated(lambda word, ms: f"{word} {ms}").poll(Query("step", 3)) == (True, "step 3")
+    refuse = mock.Mock(side_effect=UserError("wall-clock run"))
+    assert Operated(refuse).poll(Query("step", 3)) == (False, "wall-clock run")
 
 
 @pytest.mark.parametrize(
     "text", ["[" * 100_000, "[" * 3000, "9" * 4090, "[]", '{"word": ["stop"], "reason": ""}', '{"word": "stop"}']
 )
 def test_an_unreadable_request_is_answered(text: str) -> None:
-    server = OperatorRequestServer(Session(), 0, lambda request, reason: None, never)  # type: ignore[arg-type]
-    query = Query("", text=text)
-    server._asked.put(query)
-    server.poll(None)
-    assert query.answer is not None
-    assert query.answer["words"].startswith("no request")
+    done, words = Operated().poll(Query("", text=text))
+    assert not done
+    assert words.startswith("no request")
 
 
 @pytest.mark.parametrize("word", [*WORDS, *TIME_REQUESTS])
 def test_in_a_run_with_a_key_only_its_holders_may_move_the_arm(word: str) -> None:
     key = bytes(32)
-    done: list[object] = []
-    server = OperatorRequestServer(Session(), 0, lambda *sent: done.append(sent), lambda *pace: str(done.append(pace)), key)  # type: ignore[arg-type, func-returns-value]
-
-    def served(query: Query) -> bool:
-        done.clear()
-        server._asked.put(query)
-        server.poll(None)
-        return bool(done)
-
+    operated = Operated(key=key)
     valid = Query(word, key=key)
-    assert served(valid)
+    operated.poll(valid)
+    assert operated.done
     for query in (Query(word), Query(word, key=bytes(31) + b"k"), valid):  # the last is a replay
-        assert served(query) is (word in ("stop", "soft-stop", "pause"))
+        query.answer = {}
+        operated.poll(query)
+        assert bool(operated.done) is (word in ("stop", "soft-stop", "pause"))
 
 
 # -- the watchdog
@@ -261,6 +251,7 @@ PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/co
 ROLES = ("robot", "control", "tissue", "planning", "assessment")
 
 
+@pytest.fixture
 def watchdog() -> RunWatchdog:
     return RunWatchdog((*ROLES, "dashboard"), PRODUCERS)
 
@@ -282,36 +273,34 @@ def watchdog() -> RunWatchdog:
     ids=["one does not wait", "a cycle", "one computes", "no grant"],
 )
 def test_the_culprit_is_who_lets_the_others_wait(
-    reports: list[tuple[str, int, str]], silent: str, roles: set[str], words: str
+    watchdog: RunWatchdog, reports: list[tuple[str, int, str]], silent: str, roles: set[str], words: str
 ) -> None:
-    w = watchdog()
     for report in reports:
-        w.report(*report)
+        watchdog.report(*report)
     if silent:
-        w.progress[silent].reported -= 1.0
-    role, text = w.culprit(ROLES)
+        watchdog.progress[silent].reported -= 1.0
+    role, text = watchdog.culprit(ROLES)
     assert role in roles
     assert re.search(words, text), text
 
 
-def test_only_a_finished_tick_counts_as_movement() -> None:
-    w = watchdog()
-    w.report("robot", 1_000_000, "")
-    before = w.progress["robot"].moved
-    w.report("robot", 1_000_000, "control/joint_torque")
-    assert w.progress["robot"].moved == before
+def test_only_a_finished_tick_counts_as_movement(watchdog: RunWatchdog) -> None:
+    watchdog.report("robot", 1_000_000, "")
+    before = watchdog.progress["robot"].moved
+    watchdog.report("robot", 1_000_000, "control/joint_torque")
+    assert watchdog.progress["robot"].moved == before
 
 
-def test_only_the_given_roles_can_be_the_culprit() -> None:
-    w = watchdog()
-    for progress in w.progress.values():
+def test_only_the_given_roles_can_be_the_culprit(watchdog: RunWatchdog) -> None:
+    for role, progress in watchdog.progress.items():
         progress.moved -= 100.0
-    for role in ROLES:
-        w.report(role, 1_000_000, "")
-    assert w.longest_stall((*ROLES, "dashboard")) > 99.0
-    assert w.longest_stall(ROLES) < 50.0
-    assert w.longest_stall(()) < 1.0
-    assert w.culprit(ROLES)[0] != "dashboard"
+        if role in ROLES:
+            watchdog.report(role, 1_000_000, "")
+    stalls = [watchdog.longest_stall(roles) for roles in ((*ROLES, "dashboard"), ROLES, ())]
+    assert stalls[0] > 99.0
+    assert stalls[1] < 50.0
+    assert stalls[2] < 1.0
+    assert watchdog.culprit(ROLES)[0] != "dashboard"
 
 
 def test_every_error_has_a_failure_code() -> None:
