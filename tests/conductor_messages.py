@@ -23,11 +23,16 @@ from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
+from palpate_models.scenario.load import load_scenario
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)
-SETTINGS = (f"phantom.lesions=[{{centre_m: [{LESION[0]}, {LESION[1]}], radii_m: [{RADIUS}, {RADIUS}]}}]", "phantom.edge_m=0.01")
-"""Settings of this lesion, with a coarse mesh."""
+SCENARIO = load_scenario(
+    "clean",
+    (f"phantom.lesions=[{{centre_m: [{LESION[0]}, {LESION[1]}], radii_m: [{RADIUS}, {RADIUS}]}}]", "phantom.edge_m=0.01"),
+    seed=3,
+)
+"""The patient with this lesion, on a coarse mesh."""
 
 
 def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from palpate.run.folder import unless_begun
 from palpate.run.interrupts import all_is_measured, results_first
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def interrupts() -> Iterator[None]:
     """Python's own handler, which a shell replaces for a background job."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -28,7 +28,6 @@ def press() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.usefixtures("interrupts")
 def test_the_first_ctrl_c_ends_the_examination_and_the_next_is_answered(capfd: pytest.CaptureFixture[str]) -> None:
     with results_first() as ending:
         with pytest.raises(KeyboardInterrupt):
@@ -42,7 +41,6 @@ def test_the_first_ctrl_c_ends_the_examination_and_the_next_is_answered(capfd: p
         press()
 
 
-@pytest.mark.usefixtures("interrupts")
 def test_once_all_is_measured_the_first_is_answered(capfd: pytest.CaptureFixture[str]) -> None:
     with results_first() as ending:
         all_is_measured()
@@ -53,7 +51,6 @@ def test_once_all_is_measured_the_first_is_answered(capfd: pytest.CaptureFixture
             press()
 
 
-@pytest.mark.usefixtures("interrupts")
 def test_an_earlier_handler_is_still_called() -> None:
     done = []
 
@@ -70,22 +67,15 @@ def test_an_earlier_handler_is_still_called() -> None:
 
 
 def test_a_signal_that_is_ignored_stays_ignored() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with results_first() as ending:
-            press()
-        assert not ending.asked
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with results_first() as ending:
+        press()
+    assert not ending.asked
+    assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 
 
 PATIENCE_S = 120.0
 """For the first service of the run to be started."""
-
-
-def start(out: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "palpate", "run", "-o", str(out)], stderr=subprocess.PIPE, text=True)
 
 
 def services_of(pid: int) -> list[psutil.Process]:
@@ -95,7 +85,7 @@ def services_of(pid: int) -> list[psutil.Process]:
 
 def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    run = start(out)
+    run = subprocess.Popen([sys.executable, "-m", "palpate", "run", "-o", str(out)], stderr=subprocess.PIPE, text=True)
     assert wait_until(lambda: services_of(run.pid), PATIENCE_S)
     sleep(0.5)  # some are importing by now
     services = services_of(run.pid)
@@ -107,14 +97,11 @@ def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Pa
     assert not out.exists()
 
 
-def test_ctrl_c_in_an_examination_keeps_the_folder(tmp_path: Path) -> None:
-    kept, unbegun = tmp_path / "kept", tmp_path / "unbegun"
-    for folder, begun in ((kept, True), (unbegun, False)):
-        folder.mkdir()
-        with pytest.raises(KeyboardInterrupt), unless_begun(folder, lambda begun=begun: begun):  # type: ignore[misc]
-            raise KeyboardInterrupt
-    assert kept.exists()
-    assert not unbegun.exists()
+@pytest.mark.parametrize("begun", [True, False])
+def test_ctrl_c_in_an_examination_that_has_begun_keeps_the_folder(begun: bool, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), unless_begun(tmp_path, lambda: begun):
+        raise KeyboardInterrupt
+    assert tmp_path.exists() == begun
 
 
 def test_ctrl_c_during_the_start_is_a_line() -> None:

@@ -2,14 +2,16 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import permutations
 from pathlib import Path
 
 import pytest
 import yaml
-from toy_runs import run_toys
+from toy_runs import run_toys, toy_services
 
 from palpate import service
 from palpate.run import examine
@@ -23,7 +25,6 @@ from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.group import Group
-from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
@@ -48,10 +49,8 @@ ROOT = Path(__file__).parents[2]
 def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: str) -> None:
     path = tmp_path / "docker-compose.yml"
     path.write_text(text)
-    with pytest.raises(UserError) as caught:
+    with pytest.raises(UserError, match=re.escape(str(path)) + ".*" + re.escape(error)):
         read_processes(path, ("robot",))
-    assert str(path) in str(caught.value)
-    assert error in str(caught.value)
 
 
 def test_the_compose_file_is_that_of_the_project_or_of_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,18 +83,13 @@ def test_a_swap_is_an_override_whose_settings_select_the_service(name: str) -> N
     document = yaml.safe_load(file.read_text(encoding="utf-8"))["services"]
     words = document["prepare"]["environment"]["PALPATE_SETTINGS"].removesuffix("${PALPATE_SETTINGS:-}").split()
     settings = dict(setting.split("=", 1) for setting in words)
-    chosen = settings.get(f"services.{role}")
-    method = load_study("swaps").methods.get(name)
-    if method is not None:
+    if (method := load_study("swaps").methods.get(name)) is not None:
         assert settings == {**method.settings, **{f"services.{role}": choice for role, choice in method.services.items()}}
     if role == "planning":
-        assert chosen is None
         return
-    assert name == f"{role}-{chosen}"
-    scenario = load_scenario("healthy", words)
-    assert (
-        choice(scenario if chosen == "replay" else check_choices(scenario), role) == chosen
-    )  # the recording is in the container
+    chosen = name.partition("-")[2]
+    scenario = load_scenario("healthy", words)  # the recording to replay is in the container
+    assert choice(scenario if chosen == "replay" else check_choices(scenario), role) == chosen
     assert read_processes(compose_file(), (role,), (file,))[role].command == service.command(role)
     assert document[role]["build"]["args"]["GROUP"] == name
     assert document[role]["image"].endswith(f"-{name}"), "else `up` would use the image of the default service"
@@ -107,7 +101,7 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
     words = document["prepare"]["environment"]["PALPATE_SETTINGS"].split()
     scenario = load_scenario("clean", [word for word in words if "=" in word])
     roles = workers(scenario)
-    assert set(WORKERS) - set(roles) == {"tissue"}
+    assert {*WORKERS} - {*roles} == {"tissue"}
     assert document["tissue"]["profiles"] == ["simulated"]
     processes = read_processes(compose_file(), (*roles, "search", *OBSERVERS), (file,))
     assert (scenario.services.robot, scenario.services.camera) == ("lbr", "ros")
@@ -118,18 +112,18 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
 
 def test_the_end_of_a_process_is_described_by_its_log(tmp_path: Path) -> None:
     log = tmp_path / "tissue.log"
-    log.write_text("Traceback (most recent call last):\n  File ...\nMeshError: two holes\n\n")
-    assert how(3, log) == "left with status 3: MeshError: two holes"
-    assert how(-9, log) == "killed by signal 9 (SIGKILL)"
     when = "2026-11-28 13:43:09,099 tissue"
-    log.write_text(f"{when} INFO joined\n{when} ERROR services.tissue = fmu: x.fmu: refused:\n- The variable touching\n- and f\n")
-    assert how(3, log).endswith("services.tissue = fmu: x.fmu: refused: - The variable touching - and f")
-    log.write_text(f"{when} ERROR tissue failed\nTraceback (most recent call last):\n  File ...\nMeshError: two\nholes\n")
-    assert how(3, log).endswith("MeshError: two holes")
-    log.write_text("free text\nof a library\n")
-    assert how(1, log).endswith(": of a library")
-    log.write_text("")
-    assert how(1, log) == "left with status 1: its log is empty"
+    traceback = "Traceback (most recent call last):\n  File ...\nMeshError: two\nholes\n\n"
+    for text, said in (
+        (traceback, "MeshError: two holes"),
+        (f"{when} ERROR tissue failed\n{traceback}", "MeshError: two holes"),
+        (f"{when} INFO joined\n{when} ERROR x.fmu: refused:\n- touching\n- and f\n", "x.fmu: refused: - touching - and f"),
+        ("free text\nof a library\n", "of a library"),
+        ("", "its log is empty"),
+    ):
+        log.write_text(text)
+        assert how(3, log) == f"left with status 3: {said}"
+    assert how(-9, log) == "killed by signal 9 (SIGKILL)"
 
 
 # --- groups --------------------------------------------------------------------------------------------------------------
@@ -156,21 +150,15 @@ def test_a_foreign_program_shares_no_process() -> None:
     assert ServiceProcess("tissue", service.command("tissue", "elastic"), {}).shared_words() == ("elastic",)
 
 
-class Idle(Service):
-    """A service that is never stepped."""
-
-    def __init__(self, role: str) -> None:
-        self.role = role  # type: ignore[misc]
-
-    def step(self, t: int, inbox: Inbox) -> Outbox:
-        raise NotImplementedError
-
-
 def test_every_group_steps_in_the_order_of_all_roles() -> None:
     """Otherwise two groups could wait for each other for ever."""
-    whole = list(Group([Idle(role) for role in WORKERS], contract()).steppers)
-    for pair in ((a, b) for a in WORKERS for b in WORKERS if a != b):
-        assert sorted(pair, key=whole.index) == list(Group([Idle(role) for role in pair], contract()).steppers)
+
+    def order(roles: Iterable[str]) -> list[str]:
+        return list(Group([toy_services.TOYS[role]() for role in roles], contract()).steppers)
+
+    whole = order(toy_services.TOYS)
+    for pair in permutations(whole, 2):
+        assert sorted(pair, key=whole.index) == order(pair)
 
 
 # --- local processes -----------------------------------------------------------------------------------------------------
@@ -219,22 +207,15 @@ COMMAND = service.command("control")
 PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
 
 
-def absent(folder: Path) -> tuple[Absent, str]:
-    """Return the absent role control of a run, and its announcement."""
-    said: list[str] = []
-    waiting = Absent(("control",), 30.0, said.append)
-    write_places(folder, {"control": PLACE})
-    waiting.call(folder, {"control": PLACE})
-    (sentence,) = said
-    return waiting, sentence
-
-
 def run(folder: Path, runtime: str = "lockstep") -> Run:
     return Run(folder.name, {"camera": "tcp/a:1", "robot": "tcp/b:2"}, 0, runtime, None, str(folder))
 
 
 def test_an_absent_role_is_announced_and_named_if_it_does_not_answer(tmp_path: Path) -> None:
-    waiting, sentence = absent(tmp_path)
+    said: list[str] = []
+    waiting = Absent(("control",), 30.0, said.append)
+    waiting.call(tmp_path, {"control": PLACE})
+    (sentence,) = said
     for words in ("control is awaited", ENVIRONMENT["PALPATE_LISTEN"], "30 s", f"palpate join control --run {tmp_path.name}"):
         assert words in sentence
     lost = Failure(FailureCode.ROLE_LOST, "control lost at 8.000 s: killed", ("control",))
@@ -245,19 +226,14 @@ def test_an_absent_role_is_announced_and_named_if_it_does_not_answer(tmp_path: P
 def test_a_process_that_joins_is_given_command_and_environment(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="palpate run --without robot"):
         place_to_join("robot", run(tmp_path))
-    absent(tmp_path)
+    write_places(tmp_path, {"control": PLACE})
     assert place_to_join("control", run(tmp_path)) == PLACE
     with pytest.raises(UserError, match="does not wait for 'robot', but for control"):
         place_to_join("robot", run(tmp_path))
-
-
-def test_implementations_of_a_place(tmp_path: Path) -> None:
     assert command_for("control", PLACE, None) == COMMAND
     assert command_for("control", PLACE, "default") == (*COMMAND, "default")
-    with pytest.raises(PluginError, match=r"services\.robot = 'bullet': expected one of dart"):
+    with pytest.raises(PluginError, match=r"services\.robot = 'bullet'"):
         command_for("robot", PLACE, "bullet")
-    with pytest.raises(PluginError, match="no such file"):
-        command_for("robot", PLACE, str(tmp_path / "mine.py"))
 
 
 def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
@@ -276,15 +252,7 @@ def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("ticks", "late_ms", "rate"),
-    [
-        (1.0, 0.3, 1.0),
-        (0.999, 0.3, 0.5),
-        (1.0, 15.0, 0.5),
-        (0.3, 1.0, 0.25),
-        (0.5, 90.0, 0.1),
-        (0.05, 1.0, None),
-        (1.0, 500.0, None),
-    ],
+    [(1, 0.3, 1), (0.999, 0.3, 0.5), (1, 15, 0.5), (0.3, 1, 0.25), (0.5, 90, 0.1), (0.05, 1, None), (1, 500, None)],
 )
 def test_the_greatest_kept_rate_is_chosen(ticks: float, late_ms: float, rate: float | None) -> None:
     assert TimingResult(ticks, late_ms).rate == rate

@@ -3,12 +3,12 @@
 import shutil
 import subprocess
 import sys
-from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
-from conductor_messages import SETTINGS, collected, result
+from conductor_messages import SCENARIO, collected, result
 from PIL import Image
 from rich.console import Console
 from typer.testing import CliRunner
@@ -48,13 +48,11 @@ def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Pa
     run = run_of(tmp_path)
     words = ["prepare", "healthy", "--out", str(tmp_path)]
     done = CliRunner().invoke(app_for("prepare"), words)
-    assert done.exit_code == 0, done.output
     (earlier,) = tmp_path.glob(f"*-{run}")
     assert str(earlier) in done.stderr
     assert {path.name for path in earlier.iterdir()} >= {"report.json", "run.json", "scenario.yaml", "logs"}
     assert run_of(tmp_path) not in ("", run)
-    assert {"notes.txt", "scenario.yaml"} <= {path.name for path in tmp_path.iterdir()}
-    assert not (tmp_path / "report.json").exists()
+    assert [(tmp_path / name).exists() for name in ("notes.txt", "scenario.yaml", "report.json")] == [True, True, False]
     with lock_output(tmp_path):
         assert CliRunner().invoke(app_for("prepare"), words).exit_code == 2
     assert len(list(tmp_path.glob("2*"))) == 1
@@ -103,10 +101,9 @@ def test_a_killed_run_is_not_conducted_over(tmp_path: Path) -> None:
         conduct_others(tmp_path, (), realtime=False, wallclock=False, quiet=True)
 
 
-@pytest.mark.parametrize("words", [["scenarios"], ["scenarios", "--json"]])
-def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
+def test_a_command_on_a_full_disk_is_not_refused() -> None:
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "palpate", *words]
+        command = [sys.executable, "-m", "palpate", "scenarios", "--json"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (ExitStatus.TROUBLE, 1)
     assert "the output could not be written: No space left on device" in done.stderr
@@ -119,12 +116,11 @@ def test_a_scenario_cannot_place_its_results_elsewhere(name: str) -> None:
 
 
 def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_path: Path) -> None:
-    scenario = load_scenario("clean", SETTINGS, seed=3)
     one, two = tmp_path / "one", tmp_path / "two"
     reports = []
     for folder, map_too in ((one, True), (two, False)):
-        write_scenario_files(scenario, folder)
-        reports.append(write_results(folder, scenario, result(collected(map_too=map_too, truth_too=False))))
+        write_scenario_files(SCENARIO, folder)
+        reports.append(write_results(folder, SCENARIO, result(collected(map_too=map_too, truth_too=False))))
     write_page(one)
     run = run_of(one)
     assert len(run) == 12
@@ -135,9 +131,6 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
     shutil.copy(one / "evidence.mcap", two)
     with pytest.raises(EvidenceError, match="expected one run"):
         write_page(two)
-
-
-# --- files ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -151,13 +144,8 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-# --- room on the disk ----------------------------------------------------------------------------------------------------
-
-Usage = namedtuple("Usage", "total used free")
-
-
 def leave(megabytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, megabytes * 1_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=megabytes * 1_000_000))
 
 
 def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,12 +161,10 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
 
 def test_a_disk_that_fills_up_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    progress: list[RunProgress] = []
-    room = WatchedRoom(tmp_path, progress.append, said.append)
+    room = WatchedRoom(tmp_path, lambda _: None, said.append)
     for megabytes in (500, 10, 5):
         leave(megabytes, monkeypatch)
         room.check(RunProgress(0, 1.0, Collected(), ()))
-    assert len(progress) == 3
     assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
 
 
@@ -187,10 +173,8 @@ def test_results_that_a_folder_does_not_take_go_to_another_or_to_the_console(
     other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / other))
-    scenario = load_scenario("clean", SETTINGS, seed=3)
-    with pytest.raises(typer.Exit) as left:
-        conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected(truth_too=False)), quiet=True)
-    assert left.value.exit_code == ExitStatus.FAILED
+    with pytest.raises(typer.Exit, match=str(int(ExitStatus.FAILED))):
+        conclude(Console(quiet=True), tmp_path / "gone", SCENARIO, result(collected(truth_too=False)), quiet=True)
     out, err = capsys.readouterr()
     assert "RLQ" in out
     if other:
