@@ -5,20 +5,7 @@ from typing import Any
 import numpy as np
 
 from palpate.exam_state import exam_state
-from palpate_bus.messages import (
-    ExamState,
-    Finding,
-    Findings,
-    IndentationTruth,
-    PalpationSample,
-    PhantomTruth,
-    Point,
-    Pose,
-    Quaternion,
-    StiffnessMap,
-    Vector3,
-    header,
-)
+from palpate_bus import messages as msg
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
@@ -46,72 +33,52 @@ def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.concatenate((lower, upper)).astype(np.uint32)
 
 
-def mesh(vertices: np.ndarray, triangles: np.ndarray, frame: str) -> Any:
-    return mesh_message(header(0, frame), vertices, triangles=triangles)
-
-
 def phantom() -> Any:
     vertices, triangles = plane(0.14, 0.005)
     beyond = np.linalg.norm(vertices[:, :2] - LESION, axis=1) - RADIUS
     background = np.full(len(vertices), 1.7e5)
     stiffness = background * (1 + 3 * np.clip(0.5 - beyond / 0.008, 0, 1))
     lesion = np.where(beyond < 0, 0, -1).astype(np.int32)
-    pose = Pose(Point(*P_WA), Quaternion(0.0, 0.0, 0.0, 1.0))
-    return PhantomTruth(mesh(vertices, triangles, "abdomen"), stiffness, background, lesion, pose)
+    pose = msg.Pose(msg.Point(*P_WA), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
+    skin = mesh_message(msg.header(0, "abdomen"), vertices, triangles=triangles)
+    return msg.PhantomTruth(skin, stiffness, background, lesion, pose)
 
 
 def stiffness_map() -> Any:
     vertices, triangles = plane(0.12, 0.005)
     beyond = np.linalg.norm(vertices[:, :2] - FOUND, axis=1) - RADIUS
     stiffness = (1.7e5 * (1 + 3 * np.clip(0.5 - beyond / 0.012, 0, 1))).astype(np.float32)
-    apparent = (1e-5 * stiffness).astype(np.float32)
-    return StiffnessMap(
-        header=header(60_000_000_000, "abdomen"),
-        vertices=vertices.astype(np.float32).ravel(),
-        triangles=triangles.ravel(),
-        apparent=apparent,
-        lower=(0.85 * apparent).astype(np.float32),
-        upper=(apparent / 0.85).astype(np.float32),
-        force=(1.1 * apparent).astype(np.float32),
-        stiffness=stiffness,
-        scanned=(np.abs(vertices[:, :2]) <= 0.105).all(axis=1),
-        unassessed=np.where((np.abs(vertices[:, :2]) <= 0.105).all(axis=1), 0, 1).astype(np.uint8),
-        finding=np.where(beyond < 0, 0, -1).astype(np.int32),
-        common_depth=0.01,
-        background=1.7,
-        samples=400,
-    )
+    apparent, scanned = (1e-5 * stiffness).astype(np.float32), (np.abs(vertices[:, :2]) <= 0.105).all(axis=1)
+    return msg.StiffnessMap(
+        header=msg.header(60_000_000_000, "abdomen"), vertices=vertices.astype(np.float32).ravel(), triangles=triangles.ravel(),
+        apparent=apparent, lower=0.85 * apparent, upper=apparent / 0.85, force=1.1 * apparent, stiffness=stiffness,
+        scanned=scanned, unassessed=(~scanned).astype(np.uint8), finding=np.where(beyond < 0, 0, -1).astype(np.int32),
+        common_depth=0.01, background=1.7, samples=400,
+    )  # fmt: skip
 
 
 def findings(final: bool = True) -> Any:
-    one = Finding(Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999, *[0.0] * 4, Finding.KIND_LUMP)
-    return Findings(header(60_000_000_000, "abdomen"), [one], [], final)
+    one = msg.Finding(msg.Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999, *[0.0] * 4, msg.Finding.KIND_LUMP)
+    return msg.Findings(msg.header(60_000_000_000, "abdomen"), [one], [], final)
 
 
 def samples() -> list[Any]:
     places = [(x, y) for y in np.arange(-0.1, 0.11, 0.02) for x in np.arange(-0.1, 0.11, 0.01)]
     return [
-        PalpationSample(
-            header=header(k * 100_000_000, "abdomen"),
-            position=Point(float(x), float(y), 0.0),
-            normal=Vector3(0.0, 0.0, 1.0),
-            depth=0.01,
-            normal_force=2.0 + 0.01 * k,
-            tangential_speed=0.03,
-            time_in_contact=0.1 * k,
-            force_limited=False,
-            stroke=1,
-            depth_uncertainty=0.0005,
+        msg.PalpationSample(
+            header=msg.header(k * 100_000_000, "abdomen"), position=msg.Point(float(x), float(y), 0.0),
+            normal=msg.Vector3(0.0, 0.0, 1.0), depth=0.01, normal_force=2.0 + 0.01 * k, tangential_speed=0.03,
+            time_in_contact=0.1 * k, force_limited=False, stroke=1, depth_uncertainty=0.0005,
         )
         for k, (x, y) in enumerate(places)
-    ]
+    ]  # fmt: skip
 
 
 def exam_states(measured_error: float) -> list[Any]:
     return [
         exam_state(
             k * 10_000_000,
-            ExamState.PHASE_SCAN,
+            msg.ExamState.PHASE_SCAN,
             (P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
             **{"target_index": k, "target_count": 100, "targets_skipped": 2, "in_contact": True, "steady": k >= 10, "stroke": 1},
             **{"depth_setpoint": 0.01, "depth": 0.01 + measured_error, "normal_force": 2.5, "depth_uncertainty": 0.0005},
@@ -122,18 +89,13 @@ def exam_states(measured_error: float) -> list[Any]:
 
 def indentation(depth_error: float) -> list[Any]:
     return [
-        IndentationTruth(
-            header=header(k * 10_000_000, "world"),
-            depth=0.01 + depth_error if k >= 10 else 0.001,
-            normal_force=7.0 if k == 50 else 2.4,
-            tangential_force=0.5,
-            peak_force=7.2 if k == 50 else 2.5,
-            contacts=20,
-            surface_point=Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
-            stiffness=6.8e5,
+        msg.IndentationTruth(
+            header=msg.header(k * 10_000_000, "world"), depth=0.01 + depth_error if k >= 10 else 0.001,
+            normal_force=7.0 if k == 50 else 2.4, tangential_force=0.5, peak_force=7.2 if k == 50 else 2.5, contacts=20,
+            surface_point=msg.Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]), stiffness=6.8e5,
         )
         for k in range(100)
-    ]
+    ]  # fmt: skip
 
 
 def collected(
@@ -141,12 +103,13 @@ def collected(
 ) -> Collected:
     """Return all messages that the conductor collects from a whole run, or from one that ended before its map or has no truth."""
     vertices, triangles = plane(0.125, 0.005)
+    seen = vertices + P_WA + np.array((0.0, 0.0, 0.0005))
     return Collected(
         exam_states=exam_states(measured_error),
         indentation=indentation(depth_error) if truth_too else [],
         samples=samples(),
         phantom=phantom() if truth_too else None,
-        surface=mesh(vertices + P_WA + np.array((0.0, 0.0, 0.0005)), triangles, "world"),
+        surface=mesh_message(msg.header(0, "world"), seen, triangles=triangles),
         stiffness_map=stiffness_map() if map_too else None,
         findings=findings() if map_too else None,
     )

@@ -40,14 +40,7 @@ MESSAGE_SPACES = 2
 def python_texts(source: str) -> Iterator[tuple[int, str, str]]:
     """Yield line, text and kind ("docstring", "name" or "text") of docstrings, comments, messages and names."""
     tree = ast.parse(source)
-    docstrings = {
-        id(statement.value): statement
-        for node in ast.walk(tree)
-        for statement in (getattr(node, "body", None) if isinstance(getattr(node, "body", None), list) else [])
-        if isinstance(statement, ast.Expr)
-        and isinstance(statement.value, ast.Constant)
-        and isinstance(statement.value.value, str)
-    }
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}  # and other strings that stand alone
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             if id(node) in docstrings:

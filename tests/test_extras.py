@@ -24,77 +24,46 @@ PACKAGES: dict[str, Path] = {
 BARE = ""
 """No extra: the dependencies of palpate itself."""
 
-NEEDS = {
-    "palpate": "run",
-    "palpate.__init__": "study",  # lazily imported names of the library
-    "palpate.interface": "library",
-    "palpate.interface.studies": "study",
-    "palpate.fmu": "fmu",
-    "palpate.recording": "library",
-    "palpate.comparison": "library",
-    "palpate.twin": "library",
-    "palpate.live.dashboard": "dashboard",
-    "palpate.fuzz": "bench",
-    "palpate.search": "library",
-    "research.search.curves": "study",
-    "research.search.learn": "learn",
-    "research.search.whole": "study",
-    "palpate.study": "study",
-    "palpate_bus": BARE,
-    "palpate_bus.mcap_records": "recordings group",
-    "palpate_bus.recordings": "recordings group",
-    "palpate_bus.security.keys": "conductor group",
-    "palpate_errors": BARE,
-    "palpate_inputs": BARE,
-    "palpate_plugins": BARE,
-    "palpate_models": "models group",
-    "palpate_models.robot.urdf_arm": "run",  # meshes of arms
-    "palpate_planning.placement": "planning group",
-    "palpate_robot": "models group",  # modules that its backends share
-    "palpate_robot.backends.dart": "robot group",
-    "palpate_robot.backends.mujoco": "robot-mujoco group",
-    "palpate_robot.backends.lbr": "robot-lbr group",
-    "palpate_robot.backends.lbr.emulator": "run",
-    "palpate_robot.backends.ros2_control": "robot-lbr group",
-    "palpate_robot.backends.ros2_control.emulator": "run",
-    "palpate_robot.backends.arm_port": "robot-lbr group",
-    "palpate_robot.backends.emulated": "run",
-    "palpate_robot.backends.hardware": "robot-lbr group",
-    "palpate_robot.backends.watchdog": "robot-lbr group",
-    "palpate_tissue": "tissue group",
-    "palpate_tissue.backends.elastic": "tissue-elastic group",
-    "palpate_tissue.backends.fmu": "tissue-fmu group",
-    "palpate_camera": "models group",  # modules that its backends share
-    "palpate_camera.backends.kinect": "camera group",
-    "palpate_camera.backends.replay": "camera-replay group",
-    "palpate_camera.backends.ros": "camera-ros group",
-    "palpate_perception": "perception group",
-    "palpate_planning": "planning group",
-    "palpate_control": "control group",
-    "palpate_assessment": "assessment group",
-    "palpate_supervisor": "supervisor group",
-    "palpate_conductor": "conductor group",
-    "palpate_recorder": "recorder group",
-    "palpate_search": "search group",
-    "palpate_dashboard": "dashboard group",
-    "palpate_fmu": "tissue-fmu group",
-    "palpate_benchmarks": "bench",
-    "palpate_validation": "bench",
-    "palpate_reproduction": "bench",
-}
-"""The extra, or the group of an image, that a package or module needs. The longest matching name counts."""
+NAMES = {
+    BARE: ("palpate_bus", "palpate_errors", "palpate_inputs", "palpate_plugins"),
+    "run": (
+        "palpate", "palpate_models.robot.urdf_arm", "palpate_robot.backends.lbr.emulator",
+        "palpate_robot.backends.ros2_control.emulator", "palpate_robot.backends.emulated",
+    ),
+    "study": (
+        "palpate.__init__",  # lazily imported names of the library
+        "palpate.interface.studies", "palpate.study", "research.search.curves", "research.search.whole",
+    ),
+    "library": ("palpate.interface", "palpate.recording", "palpate.comparison", "palpate.twin", "palpate.search"),
+    "fmu": ("palpate.fmu",),
+    "dashboard": ("palpate.live.dashboard",),
+    "bench": ("palpate.fuzz", "palpate_benchmarks", "palpate_validation", "palpate_reproduction"),
+    "learn": ("research.search.learn",),
+    "recordings group": ("palpate_bus.mcap_records", "palpate_bus.recordings"),
+    "models group": ("palpate_models", "palpate_robot", "palpate_camera"),  # modules that all backends share
+    "robot group": ("palpate_robot.backends.dart",),
+    "robot-mujoco group": ("palpate_robot.backends.mujoco",),
+    "robot-lbr group": tuple(
+        f"palpate_robot.backends.{name}" for name in ("lbr", "ros2_control", "arm_port", "hardware", "watchdog")
+    ),
+    "tissue-elastic group": ("palpate_tissue.backends.elastic",),
+    "tissue-fmu group": ("palpate_tissue.backends.fmu", "palpate_fmu"),
+    "camera group": ("palpate_camera.backends.kinect",),
+    "camera-replay group": ("palpate_camera.backends.replay",),
+    "camera-ros group": ("palpate_camera.backends.ros",),
+    "conductor group": ("palpate_conductor", "palpate_bus.security.keys"),
+    **{
+        f"{role} group": (f"palpate_{role}",)
+        for role in ("tissue", "perception", "planning", "control", "assessment", "supervisor", "recorder", "search", "dashboard")
+    },
+}  # fmt: skip
+"""Packages and modules by the extra, or the group of an image, that they need. The longest matching name counts."""
+NEEDS = {name: need for need, names in NAMES.items() for name in names}
 DISTRIBUTION = {
-    "PIL": "pillow",
-    "markupsafe": "jinja2",
-    "pinocchio": "pin",
-    "rerun": "rerun-sdk",
-    "sklearn": "scikit-learn",
-    "stable_baselines3": "stable-baselines3",
-    "rerun_cli": "rerun-sdk",
-    "robust_laplacian": "robust-laplacian",
-    "yaml": "pyyaml",
-    "zenoh": "eclipse-zenoh",
-}
+    "PIL": "pillow", "markupsafe": "jinja2", "pinocchio": "pin", "rerun": "rerun-sdk", "rerun_cli": "rerun-sdk",
+    "sklearn": "scikit-learn", "stable_baselines3": "stable-baselines3", "robust_laplacian": "robust-laplacian",
+    "yaml": "pyyaml", "zenoh": "eclipse-zenoh",
+}  # fmt: skip
 """Distributions by the name of the import, where it differs."""
 OPTIONAL = {"zenoh_ros2_sdk"}
 """Imported only if find_spec finds it; in no extra."""

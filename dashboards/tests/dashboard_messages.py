@@ -9,42 +9,11 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from palpate_bus import messages as msg
 from palpate_bus.contract import contract
-from palpate_bus.messages import (
-    Clock,
-    DiagnosticArray,
-    DiagnosticStatus,
-    ExamState,
-    Finding,
-    Findings,
-    IndentationTruth,
-    KeyValue,
-    PalpationTargets,
-    Path,
-    PatientTruth,
-    PhantomTruth,
-    Point,
-    Pose,
-    PoseStamped,
-    Quaternion,
-    RobotStatus,
-    StiffnessMap,
-    Vector3,
-    codec,
-    header,
-    time_message,
-)
-from palpate_bus.messages.geometry import (
-    camera_info,
-    cloud_message,
-    depth_message,
-    frames_message,
-    mesh_message,
-    point_message,
-    wrench_message,
-)
+from palpate_bus.messages import geometry
 from palpate_bus.testing import HandInbox
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, look_at
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import link_transforms
 from palpate_models.scenario.schema import Robot
@@ -70,10 +39,10 @@ class FakeInbox(HandInbox):
         return [self.messages[topic]] if topic in self.messages else []
 
 
-def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
+def forward(joints: Array) -> dict[str, tuple[Array, Rotation]]:
     """Link positions and rotations in world."""
     X = {"world": np.eye(4)}
-    for parent, link, X_PL in link_transforms(joints, robot):
+    for parent, link, X_PL in link_transforms(joints, Robot()):
         X[link] = X[parent] @ X_PL
     return {link: (pose[:3, 3], Rotation.from_matrix(pose[:3, :3])) for link, pose in X.items() if link != "world"}
 
@@ -85,21 +54,20 @@ def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = (k.ravel() for k in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
-    triangles = np.vstack((np.stack((a, b, d), 1), np.stack((a, d, c), 1))).astype(np.uint32)
-    return vertices, triangles
+    return vertices, np.vstack((np.stack((a, b, d), 1), np.stack((a, d, c), 1))).astype(np.uint32)
 
 
 def surface(t: int, vertices: NDArray[np.float32], triangles: NDArray[np.uint32], frame: str) -> Any:
-    return mesh_message(header(t, frame), vertices, triangles=triangles)
+    return geometry.mesh_message(msg.header(t, frame), vertices, triangles=triangles)
 
 
 def pose(position: Array, rotation: Rotation | None = None) -> Any:
     q = (0.0, 0.0, 0.0, 1.0) if rotation is None else rotation.as_quat()
-    return Pose(Point(*map(float, position)), Quaternion(*map(float, q)))
+    return msg.Pose(msg.Point(*map(float, position)), msg.Quaternion(*map(float, q)))
 
 
 def transforms(t: int, poses: dict[str, tuple[Array, Rotation]]) -> Any:
-    return frames_message(header(t, "world"), list(poses), np.array([(*p, *r.as_quat()) for p, r in poses.values()]))
+    return geometry.frames_message(msg.header(t, "world"), list(poses), np.array([(*p, *r.as_quat()) for p, r in poses.values()]))
 
 
 def ratio_field(vertices: NDArray[np.float32]) -> Array:
@@ -112,13 +80,10 @@ def latched() -> Messages:
     ratio = ratio_field(vertices)
     lesion = np.where(ratio > 2.5, 0, -1).astype(np.int32)
     background = np.full(len(vertices), 1.7e5)
-    truth = PhantomTruth(surface(0, vertices, triangles, "abdomen"), ratio * background, background, lesion, pose(X_WA))
-    camera = np.array((0.95, -0.45, 1.85))
-    z = (np.array((0.56, 0.0, 0.9)) - camera) / np.linalg.norm(np.array((0.56, 0.0, 0.9)) - camera)
-    x = np.cross(z, (0, 0, 1.0))
-    x /= np.linalg.norm(x)
-    rotation = Rotation.from_matrix(np.column_stack((x, np.cross(z, x), z)))
-    return {"truth/phantom": truth, "tf_static": transforms(0, {"camera_depth_optical_frame": (camera, rotation)})}
+    truth = msg.PhantomTruth(surface(0, vertices, triangles, "abdomen"), ratio * background, background, lesion, pose(X_WA))
+    X_WC = look_at(np.array((0.95, -0.45, 1.85)), np.array((0.56, 0.0, 0.9)))
+    camera = X_WC[:3, 3], Rotation.from_matrix(X_WC[:3, :3])
+    return {"truth/phantom": truth, "tf_static": transforms(0, {"camera_depth_optical_frame": camera})}
 
 
 def look(t: int) -> Messages:
@@ -134,15 +99,15 @@ def look(t: int) -> Messages:
     targets = world[(np.abs(vertices[:, :2]) < 0.1).all(axis=1)][::3]
     above = targets + np.array((0.0, 0.0, 0.02))
     return {
-        "camera/depth/camera_info": camera_info(header(t, frame), (480, 640), k),
-        "camera/depth/image_raw": depth_message(header(t, frame), image),
-        "perception/points": cloud_message(header(t, "world"), cloud),
+        "camera/depth/camera_info": geometry.camera_info(msg.header(t, frame), (480, 640), k),
+        "camera/depth/image_raw": geometry.depth_message(msg.header(t, frame), image),
+        "perception/points": geometry.cloud_message(msg.header(t, "world"), cloud),
         "perception/surface": surface(t, world, triangles, "world"),
-        "perception/targets": PalpationTargets(
-            header(t, "world"), [point_message(p) for p in targets], [Vector3(0.0, 0.0, 1.0)] * len(targets),
+        "perception/targets": msg.PalpationTargets(
+            msg.header(t, "world"), [geometry.point_message(p) for p in targets], [msg.Vector3(0.0, 0.0, 1.0)] * len(targets),
             np.zeros(len(targets), np.uint32), 0.001, 20, 1.0, 0, "",
         ),
-        "planning/path": Path(header(t, "world"), [PoseStamped(header(t, "world"), pose(p)) for p in above]),
+        "planning/path": msg.Path(msg.header(t, "world"), [msg.PoseStamped(msg.header(t, "world"), pose(p)) for p in above]),
     }  # fmt: skip
 
 
@@ -151,28 +116,28 @@ def stiffness_map(t: int, share: float) -> Any:
     scanned = (np.abs(vertices[:, :2]) < 0.1).all(axis=1) & (vertices[:, 1] < -0.1 + 0.2 * share)
     mean = (1.7e5 * ratio_field(vertices)).astype(np.float32)
     none = np.full(len(vertices), -1, np.int32)
-    return StiffnessMap(
-        header(t, "abdomen"), vertices.ravel(), triangles.ravel(), 1e-5 * mean, 0.8e-5 * mean, 1.2e-5 * mean, 1e-5 * mean, mean,
-        scanned, np.where(scanned, 0, 1).astype(np.uint8), none, 0.01, 1.7, 100,
+    return msg.StiffnessMap(
+        msg.header(t, "abdomen"), vertices.ravel(), triangles.ravel(), 1e-5 * mean, 0.8e-5 * mean, 1.2e-5 * mean, 1e-5 * mean,
+        mean, scanned, np.where(scanned, 0, 1).astype(np.uint8), none, 0.01, 1.7, 100,
     )  # fmt: skip
 
 
 def findings(t: int) -> Any:
-    item = Finding(Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99, *[0.0] * 4, Finding.KIND_LUMP)
-    return Findings(header(t, "abdomen"), [item], [], True)
+    item = msg.Finding(msg.Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99, *[0.0] * 4, msg.Finding.KIND_LUMP)
+    return msg.Findings(msg.header(t, "abdomen"), [item], [], True)
 
 
 def robot_status(t: int, torque: Array) -> Any:
     """The rest of the message is not drawn."""
     zero = np.zeros(7)
-    return RobotStatus(header(t), 1, 0, "", zero, zero, wrench_message(zero), torque, 0, "", torque)
+    return msg.RobotStatus(msg.header(t), 1, 0, "", zero, zero, geometry.wrench_message(zero), torque, 0, "", torque)
 
 
 def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:
     pressed = force > 0.1
-    return ExamState(
-        header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
-        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, 1, False, 0, "",
+    return msg.ExamState(
+        msg.header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
+        depth, force, msg.Point(0.0, 0.0, 0.0), msg.Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, 1, False, 0, "",
     )  # fmt: skip
 
 
@@ -181,7 +146,7 @@ def patient(s: float) -> tuple[float, Any]:
     return 0.004 * (1 - float(np.cos(6 * np.pi * s))), pose(X_WA + np.array((0.010 if s > 0.5 else 0.0, 0.0, 0.0)))
 
 
-def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, Messages]]:
+def run(seconds: float, step_ms: int = 50) -> Iterator[tuple[int, Messages]]:
     """(time [ns], messages that arrived since the step before)."""
     rest, triangles = dome()
     world = rest + X_WA
@@ -189,7 +154,7 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
         s = t / (seconds * 1e9)
         new: Messages = latched() if t == 0 else {}
         joints = lbr.HOME + np.array((0.4 * np.sin(6.28 * s), 0.5 * s, 0, 0.2 * s, 0, 0, 0))
-        poses = forward(joints, robot)
+        poses = forward(joints)
         pressing = s > 0.3
         centre = np.array((-0.1 + 0.2 * s, 0.09 * np.sin(12 * s)))
         dent = 0.01 * np.exp(-((rest[:, :2] - centre) ** 2).sum(axis=1) / 2 / 0.02**2) if pressing else 0.0
@@ -204,10 +169,10 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
             "sim/link_poses": transforms(t, poses),
             "sim/surface": surface(t, moved.astype(np.float32), triangles, "world"),
             "exam/state": exam(t, phase, "scanning line 3" if pressing else "", depth, force, int(200 * s)),
-            "truth/indentation": IndentationTruth(header(t, "world"), depth, force, 0.3, force, 9, Point(0.0, 0.0, 0.0), 1.7e5),
-            "truth/patient": PatientTruth(header(t, "world"), *patient(s)),
+            "truth/indentation": msg.IndentationTruth(msg.header(t), depth, force, 0.3, force, 9, msg.Point(0, 0, 0), 1.7e5),
+            "truth/patient": msg.PatientTruth(msg.header(t, "world"), *patient(s)),
             "robot/status": robot_status(t, 20.0 * np.sin(6 * s + np.arange(7.0))),
-            "clock": Clock(time_message(t)),
+            "clock": msg.Clock(msg.time_message(t)),
         }
         if 0.1 < s < 0.3:
             new |= look(t)
@@ -216,9 +181,9 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
         if s > 0.95:
             new["assessment/findings"] = findings(t)
         if t % (1000 * MS) == 0:
-            step = [KeyValue("step", "0.1 ms")]
-            rows = [DiagnosticStatus(0, role, "running", "", step) for role in ("robot", "tissue", "control")]
-            new["diagnostics"] = DiagnosticArray(header(t), rows)
+            step = [msg.KeyValue("step", "0.1 ms")]
+            rows = [msg.DiagnosticStatus(0, role, "running", "", step) for role in ("robot", "tissue", "control")]
+            new["diagnostics"] = msg.DiagnosticArray(msg.header(t), rows)
         yield t, new
 
 
@@ -236,6 +201,6 @@ def write_recording(folder: Folder, steps: Iterable[tuple[int, Messages]]) -> Fo
                 if topic not in channels:
                     schema = writer.register_schema(kind, "ros2msg", b"")
                     channels[topic] = writer.register_channel(f"/{topic}", "cdr", schema)
-                writer.add_message(channels[topic], t, codec.encode(message, kind), t)
+                writer.add_message(channels[topic], t, msg.codec.encode(message, kind), t)
         writer.finish()
     return path

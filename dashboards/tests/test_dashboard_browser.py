@@ -1,4 +1,4 @@
-"""A run that is served live, looked at in a headless browser: the scene is really drawn, for a viewer that joins late."""
+"""A run that a viewer joins late, looked at in a headless browser: the scene is really drawn."""
 
 import os
 import shutil
@@ -8,11 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 from time import monotonic, sleep
-from typing import IO
 
 import numpy as np
 import pytest
-from dashboard_messages import FakeInbox, run
 
 from palpate_dashboard import palette
 from palpate_dashboard.picture import BROWSERS, SCREENSHOTS, page_at, screenshot
@@ -20,9 +18,8 @@ from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.scenario.schema import Scenario
 
-SCENE = {"skin": (palette.SKIN, 4, 0.001), "table": (palette.SHEET, 4, 0.001)}
+SCENE = {"skin": (palette.SKIN, 4, 0.001), "table": (palette.SHEET, 4, 0.001), "curve": (palette.FORCE, 6, 0.0001)}
 """Required content of the scene: colour, reach of its hue [deg], part of the page (of a small region 0.003 is skin)."""
-CURVE = {"curve": (palette.FORCE, 6, 0.0001)}
 
 
 def free_ports() -> int:
@@ -59,8 +56,8 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
     pytest.fail(f"nothing listens at {port} after {SCREENSHOTS.timeout_s} s")
 
 
-def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> np.ndarray:
-    """Return the page in a headless browser, once each colour fills its share: (colour, reach of hue [deg], share)."""
+def look_for_the_scene(port: int) -> np.ndarray:
+    """Return the page in a headless browser, once each colour of SCENE fills its share."""
     pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")
@@ -69,33 +66,10 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> n
     with page_at(port, 1000, 700) as page:
         while monotonic() < until:
             image = screenshot(page)
-            seen = {name: share(image, color, reach) for name, (color, reach, _) in wanted.items()}
-            if all(seen[name] > least for name, (_, _, least) in wanted.items()):
+            seen = {name: share(image, color, reach) for name, (color, reach, _) in SCENE.items()}
+            if all(seen[name] > least for name, (_, _, least) in SCENE.items()):
                 return image
     pytest.fail(f"not drawn within {SCREENSHOTS.timeout_s} s: {seen}")
-
-
-def start(words: list[str], environment: dict[str, str], log: IO[str] | None = None) -> subprocess.Popen[bytes]:
-    """Start a command that responds to Ctrl+C, which processes in the background of a shell ignore by inheritance."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        return subprocess.Popen(words, env=environment, stdout=log, stderr=log)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.browser
-@pytest.mark.timeout(900)
-def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
-    port = free_ports()
-    service = DashboardService(Scenario(name="live"), tmp_path / FILE, Live(serve_port=port))
-    inbox = FakeInbox()
-    for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
-        inbox.bring(t, new)
-        service.step(t, inbox)
-    image = look_for(port, SCENE | CURVE)
-    assert share(image, palette.TRUTH, 6) < 0.0002  # nothing of the truth is drawn until it is asked for
-    service.finish()
 
 
 @pytest.mark.browser
@@ -106,7 +80,9 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
     environment = {**os.environ, "PALPATE_RUNS": str(tmp_path / "runs"), "OMP_NUM_THREADS": "1"}
     settings = ["exam.region_m=[0.06,0.06]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]
     words = [word for setting in settings for word in ("--set", setting)]
-    running = start([palpate, "run", "--quiet", "--realtime", "--out", str(tmp_path / "out"), *words], environment)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it, and what they start, too
+    command = [palpate, "run", "--quiet", "--realtime", "--out", str(tmp_path / "out"), *words]
+    running = subprocess.Popen(command, env=environment)
     recording = tmp_path / "out" / "recording_mcap" / "recording_mcap_0.mcap"
     watching = None
     try:
@@ -115,9 +91,10 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
             assert running.poll() is None, "the run ended before it could be joined"
             assert monotonic() < until, "the run did not start"
             sleep(0.5)
-        watching = start([palpate, "dashboard", "--port", str(port)], environment)
+        watching = subprocess.Popen([palpate, "dashboard", "--port", str(port)], env=environment)
         wait_for(port + 1, watching)
-        look_for(port, SCENE | CURVE)
+        image = look_for_the_scene(port)
+        assert share(image, palette.TRUTH, 6) < 0.0002  # nothing of the truth is drawn until it is asked for
     finally:
         for process in (watching, running):
             if process is not None:

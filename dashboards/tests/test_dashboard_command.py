@@ -1,6 +1,7 @@
 """`palpate dashboard`: what it shows when it is given what; a recording that is still written; a run that is joined late."""
 
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -25,17 +26,14 @@ def record(folder: Path, seconds: float) -> Path:
     """Return the recording of a run's folder with hand-made messages."""
     folder.mkdir(exist_ok=True)
     (folder / "scenario.yaml").write_text(dump_scenario(Scenario(name="recorded")), encoding="utf-8")
-    return write_recording(folder, run(seconds, Scenario().robot))
+    return write_recording(folder, run(seconds))
 
 
 def test_nothing_to_show_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    done = CliRunner().invoke(app, ["dashboard"])
-    assert done.exit_code == 2
-    assert "start one with `palpate run`, or give a results folder" in done.output
-    done = CliRunner().invoke(app, ["dashboard", str(tmp_path / "nothing")])
-    assert done.exit_code == 2
-    assert "neither a .rrd nor a .mcap file" in done.output
+    for words, said in (([], "`palpate run`"), ([str(tmp_path / "nothing")], "neither a .rrd nor a .mcap file")):
+        done = CliRunner().invoke(app, ["dashboard", *words])
+        assert (done.exit_code, said in done.output) == (2, True), done.output
 
 
 def test_a_recording_that_is_still_written_is_drawn_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -51,8 +49,8 @@ def test_a_recording_that_is_still_written_is_drawn_as_far_as_it_goes(tmp_path: 
 
 def test_a_recording_in_several_files_is_read_whole(tmp_path: Path) -> None:
     path = record(tmp_path, 1.0)
-    shutil.copy(path, path.with_name("recording_mcap_1.mcap"))
-    shutil.copy(path, path.with_name("recording_mcap_10.mcap"))
+    for number in (1, 10):
+        shutil.copy(path, path.with_name(f"recording_mcap_{number}.mcap"))
     files = replay.recording_of(tmp_path)
     assert [file.name for file in files] == [f"recording_mcap_{n}.mcap" for n in (0, 1, 10)]
     assert len(list(replay.messages(files))) == 3 * len(list(replay.messages(files[:1])))
@@ -65,13 +63,9 @@ def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) 
     assert replay.replay(*source, tmp_path / FILE, received.append) == tmp_path / FILE
     assert received == sorted(received)
     assert received[-1] >= 0.9e9
-
-    def interrupted(t: int) -> None:
-        raise KeyboardInterrupt
-
     (tmp_path / FILE).unlink()
     with pytest.raises(KeyboardInterrupt):
-        replay.replay(*source, tmp_path / FILE, interrupted)
+        replay.replay(*source, tmp_path / FILE, lambda _: signal.raise_signal(signal.SIGINT))
     assert not (tmp_path / FILE).exists(), "half a drawing would be taken for the whole"
 
 
