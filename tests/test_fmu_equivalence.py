@@ -24,14 +24,10 @@ def path(surface: SkinSurface) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]
     """Return positions and velocities of a press, a hold, a slide over the lesion, a withdrawal and a wait."""
     x = np.concatenate((np.full(800, -0.09), np.linspace(-0.09, -0.01, 1600), np.full(1000, -0.01)))
     depth = np.concatenate((np.linspace(-0.003, 0.010, 400), np.full(2400, 0.010), np.linspace(0.010, -0.05, 600)))
-    points = []
-    for at, below in zip(x, depth, strict=True):
-        under = surface.nearest(np.array((at, -0.055, 0.0)))
-        points.append(under.position + (RADIUS_M - below) * under.normal)
-    position = np.array(points)
-    velocity = np.gradient(position, STEP_S, axis=0)
+    under = [surface.nearest(np.array((at, -0.055, 0.0))) for at in x]
+    position = np.array([one.position + (RADIUS_M - below) * one.normal for one, below in zip(under, depth, strict=True)])
     spin = np.tile((0.2, -0.1, 0.5), (len(x), 1))
-    return list(zip(position, velocity, spin, strict=True))
+    return list(zip(position, np.gradient(position, STEP_S, axis=0), spin, strict=True))
 
 
 BREATHING = "phantom.breathing.kind=quiet"
@@ -46,16 +42,8 @@ PERSON = "phantom={kind: person, draw: {lumps: [2, 2]}, lesions: [{centre_m: [-0
 
 @pytest.mark.parametrize(
     "settings",
-    [
-        (),
-        (BREATHING,),
-        (FINE,),
-        (STIFFENING,),
-        (STRAIGHT_SOON, INVOLUNTARY),
-        (STIFFENING, VOLUNTARY, BREATHING, FINE),
-        (PERSON, BREATHING),
-    ],
-    ids=["default", "breathing", "fine mesh", "stiffening", "guarding", "all", "person"],
+    [(), (STRAIGHT_SOON, INVOLUNTARY), (STIFFENING, VOLUNTARY, BREATHING, FINE), (PERSON, BREATHING)],
+    ids=["default", "guarding", "all", "person"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("clean", settings)
@@ -87,4 +75,3 @@ def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple
     assert difference[:3].max() < BOUND * scale, difference
     assert difference[3:].max() < BOUND * scale * RADIUS_M, difference
     assert moved < BOUND * largest
-    print(f"force {difference[:3].max() / scale:.1e}, displacement {moved / largest:.1e}, sub-steps {tissue.substeps}")

@@ -66,12 +66,11 @@ def test_a_documented_command_parses(page: str, line: str) -> None:
 
 
 @pytest.mark.pages
-def test_a_wrong_command_is_refused() -> None:
+@pytest.mark.parametrize("words", [["run", "--nosuch"], ["topic", "nosuch"]])
+def test_a_wrong_command_is_refused(words: list[str]) -> None:
     assert len(lines()) > 60
-    with pytest.raises(Exception, match="--nosuch"):
-        parse(["run", "--nosuch"])
-    with pytest.raises(AssertionError, match="no command"):
-        parse(["topic", "nosuch"])
+    with pytest.raises(Exception, match="nosuch"):
+        parse(words)
 
 
 def anchors(page: Path) -> set[str]:
@@ -88,8 +87,7 @@ def test_links_have_targets(page: Path) -> None:
         if re.match(r"[a-z]+:", link):
             continue
         path, _, anchor = link.partition("#")
-        target = page.parent / path if path else page
-        target = Path(os.path.normpath(target))
+        target = Path(os.path.normpath(page.parent / path)) if path else page
         if target in GENERATED and not target.exists():
             continue
         if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
@@ -115,15 +113,13 @@ def test_the_site_builds_without_warnings_or_network(tmp_path: Path, monkeypatch
     config.write_text(
         f"INHERIT: {ROOT / 'mkdocs.yml'}\ndocs_dir: {tmp_path / 'pages'}\nsite_dir: {tmp_path / 'site'}\n", encoding="utf-8"
     )
+    monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
     command = [sys.executable, "-m", "mkdocs", "build", "-f", str(config)]
-    done = subprocess.run(
-        command, cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for page in (tmp_path / "site").rglob("*.html"):
-        assert not LOADED.findall(page.read_text(encoding="utf-8")), page
-    for sheet in (tmp_path / "site").rglob("*.css"):
-        assert not STYLE.findall(sheet.read_text(encoding="utf-8")), sheet
+    for suffix, loaded in (("html", LOADED), ("css", STYLE)):
+        for page in (tmp_path / "site").rglob(f"*.{suffix}"):
+            assert not loaded.findall(page.read_text(encoding="utf-8")), page
 
 
 def _titled(notebook: Path, into: Path) -> None:
@@ -171,20 +167,12 @@ def test_the_example_tissue_conforms() -> None:
     assert called.exit_code == 0, called.output
 
 
-QUICK_START = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
-
-
-def commands() -> list[list[str]]:
-    """Return the arguments of every indented `palpate run`."""
-    lines = [line.partition("#")[0] for line in re.findall(r"^    palpate run(.*)$", QUICK_START, re.MULTILINE)]
-    return [shlex.split(line) for line in lines]
-
-
 @pytest.mark.pages
-def test_every_command_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_run_of_the_quick_start_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    assert len(commands()) >= 6
-    for words in commands():
+    runs = [shlex.split(line)[1:] for page, line in lines() if page == "docs/quick-start.md" and line.split()[0] == "run"]
+    assert len(runs) >= 6
+    for words in runs:
         settings = [value for flag, value in pairwise(words) if flag == "--set"]
         settings += settings_of([value for flag, value in pairwise(words) if flag == "--service"])
         name = words[0] if words and not words[0].startswith("--") else "clean"
@@ -221,7 +209,6 @@ def test_the_example_assessment_finds_the_lesion(tmp_path: Path) -> None:
     assert ran.status == 0, ran.output
     assert ran.report["scores"]["matched"] == 1
     assert ran.report["scores"]["place_error_m"] < 0.02
-    assert (tmp_path / "report.html").is_file()
 
 
 FOUND = re.compile(r"^    (?:palpate (run .*--composed.*)|([RL][UL]Q +\(.*))$", re.MULTILINE)

@@ -51,7 +51,7 @@ def true_radius(chance: float, felt_contrast: float, depth_m: float, lapse: floa
 def case(number: int, population: str, **fields: Any) -> dict[str, Any]:
     """Return a row of cases.parquet."""
     method = fields.get("method", "palpate")
-    row = {
+    return {
         "case_id": f"{population}-{number}-{method}-{fields.get('errors', 'typical')}",
         "study": "synthetic", "population": population, "method": method, "split": "test", "number": number,
         "seed": 1000 + number,
@@ -59,28 +59,26 @@ def case(number: int, population: str, **fields: Any) -> dict[str, Any]:
         "palpable": 0, "not_palpable": 0, "matched": 0, "missed": 0, "false_findings": 0, "score": 0.0, "coverage_area": 0.9,
         "coverage_lumps": 0.9, "coverage_ratio": np.nan, "depth_rms_m": 3e-4, "peak_force_n": 9.0, "exam_time_s": 200.0,
         "sim_time_s": 220.0, "wall_time_s": 80.0, "assess_time_s": 4.0, "loop_examinations": np.nan,
+        **fields,
     }  # fmt: skip
-    return row | fields
 
 
 def finding(case_id: str, confidence: float, lump: int, **fields: Any) -> dict[str, Any]:
     """Return a row of findings.parquet."""
-    row = {
+    return {
         "case_id": case_id, "index": 0, "reported": confidence >= 0.5, "x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "area_m2": 1.1e-3,
         "ratio": 1.6, "ratio_lower": 1.3, "ratio_upper": 1.9, "confidence": confidence, "lump": lump,
         "place_error_m": 4e-3 if lump >= 0 else np.nan, "area_true_m2": 1e-3 if lump >= 0 else np.nan,
-        "ratio_true": 1.5 if lump >= 0 else np.nan,
+        "ratio_true": 1.5 if lump >= 0 else np.nan, **fields,
     }  # fmt: skip
-    return row | fields
 
 
 def lump(case_id: str, **fields: Any) -> dict[str, Any]:
     """Return a row of lumps.parquet."""
-    row = {
+    return {
         "case_id": case_id, "lump": 0, "felt_contrast": 1.5, "felt_radius_m": 0.015, "depth_m": 0.01, "radius_m": 0.015,
-        "contrast": 4.0, "palpable": True, "found": False, "confidence": 0.0, "place_error_m": np.nan,
+        "contrast": 4.0, "palpable": True, "found": False, "confidence": 0.0, "place_error_m": np.nan, **fields,
     }  # fmt: skip
-    return row | fields
 
 
 def tables(cases: list[dict[str, Any]], findings: list[dict[str, Any]], lumps: list[dict[str, Any]]) -> Tables:

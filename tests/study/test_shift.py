@@ -106,5 +106,4 @@ def test_the_split_has_a_population_by_family_and_seeds_of_its_own() -> None:
 
 @pytest.mark.parametrize("name", ["operating-point", "detectability", "release"])
 def test_the_studies_have_every_family(name: str) -> None:
-    for population in load_study(name).populations.values():
-        assert set(population.number.shift) in (set(Family), set())
+    assert all(set(one.number.shift) in (set(Family), set()) for one in load_study(name).populations.values())

@@ -10,15 +10,15 @@ from synthetic import TOY, study
 
 from palpate.study.cases import Case, Request, cases_of, command_of, patient_seeds, secret_of
 from palpate.study.folder import SESSIONS, Folder, Outcome, Session, manifest_of, merge
-from palpate.study.spec import Grid, Lumps, StudyError, load_study, study_names
+from palpate.study.spec import Grid, Lumps, Study, StudyError, load_study, study_names
 
 PLAIN = "populations: {a: {scenario: person}}\n"
 
 
-def written(tmp_path: Path, text: str) -> str:
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    return str(path)
+def load(folder: Path, text: str) -> Study:
+    """Load a study file with this text."""
+    (folder / "mine.yaml").write_text(text)
+    return load_study(str(folder / "mine.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -42,9 +42,8 @@ def written(tmp_path: Path, text: str) -> str:
 )  # fmt: skip
 def test_a_wrong_study_is_refused_by_file_field_and_value(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
     with pytest.raises(StudyError) as caught:
-        load_study(written(tmp_path, text))
-    for word in words:
-        assert word in str(caught.value)
+        load(tmp_path, text)
+    assert all(word in str(caught.value) for word in words), caught.value
 
 
 def test_an_unknown_study_is_answered_with_the_known_ones() -> None:
@@ -59,14 +58,14 @@ def test_an_unknown_study_is_answered_with_the_known_ones() -> None:
         ({"scenario": "nosuch"}, ("populations.clean", "nosuch: no such scenario")),
         ({"lumps": {}}, ("populations.clean", "draw belongs to kind: person")),
         ({"settings": {"services.tissue": "jelly"}}, ("services.tissue", "jelly", "winkler")),
+        ({"number": {}}, ("number.test",)),
     ],
 )
 def test_a_scenario_that_cannot_be_is_named_with_its_population(changes: dict[str, object], words: tuple[str, ...]) -> None:
     population = {**TOY["populations"]["clean"], **changes}
     with pytest.raises(StudyError) as caught:
         cases_of(study(populations={"clean": population}))
-    for word in words:
-        assert word in str(caught.value)
+    assert all(word in str(caught.value) for word in words), caught.value
 
 
 @pytest.mark.parametrize("name", study_names())
@@ -77,11 +76,10 @@ def test_the_studies_that_come_with_the_project_can_be_made(name: str) -> None:
 
 def test_grids_give_every_combination_in_turn() -> None:
     lumps = Lumps(radius_m=Grid(grid=(0.01, 0.02)), contrast=Grid(grid=(2, 4, 8)))
-    assert len(lumps.cells()) == 6
     population = {"scenario": "person", "number": {"test": 7}, "lumps": lumps.model_dump()}
     cases = cases_of(study(populations={"lumps": population}))
     contrasts = [case.scenario["phantom"]["lesions"][0]["contrast"] for case in cases]
-    assert contrasts == pytest.approx([2, 4, 8, 2, 4, 8, 2])
+    assert (len(lumps.cells()), contrasts) == (6, pytest.approx([2, 4, 8, 2, 4, 8, 2]))
 
 
 def test_one_error_at_a_time_changes_that_error_alone() -> None:
@@ -95,7 +93,7 @@ def test_one_error_at_a_time_changes_that_error_alone() -> None:
 def test_files_are_looked_for_beside_the_study(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("def create(scenario): ...")
     text = yaml.safe_dump({**TOY, "methods": {"mine": {"services": {"assessment": "mine.py"}}}})
-    assert load_study(written(tmp_path, text)).methods["mine"].services == {"assessment": str(tmp_path / "mine.py")}
+    assert load(tmp_path, text).methods["mine"].services == {"assessment": str(tmp_path / "mine.py")}
 
 
 def test_ids_do_not_depend_on_what_things_are_called() -> None:
@@ -142,11 +140,9 @@ def test_the_command_states_every_option() -> None:
 
 
 def test_patients_are_the_same_for_all_methods_and_errors() -> None:
-    cases = cases_of(
-        study(errors={"none": "none", "poor": "poor"}, methods={"a": {}, "b": {"settings": {"exam.depth_m": 0.008}}})
-    )
-    for number in range(3):
-        assert len({case.seed for case in cases if case.number == number}) == 1
+    methods = {"a": {}, "b": {"settings": {"exam.depth_m": 0.008}}}
+    cases = cases_of(study(errors={"none": "none", "poor": "poor"}, methods=methods))
+    assert len({(case.number, case.seed) for case in cases}) == 3
     assert len({case.case_id for case in cases}) == len(cases) == 12
 
 
@@ -161,18 +157,14 @@ def test_splits_share_no_patient_and_more_patients_change_none() -> None:
     assert max(tune) < 1000 <= min(test)
     assert patient_seeds("s", "p", "tune", 100, "salt") == tune[:100]
     assert len(set(patient_seeds("s", "p", "tune", 1000, ""))) == 1000
-
-
-@pytest.mark.parametrize("split", ["tune", "test"])
-def test_a_salt_changes_the_patients_of_the_split_test_alone(split: str) -> None:
-    same = patient_seeds("s", "p", split, 5, "one") == patient_seeds("s", "p", split, 5, "two")
-    assert same == (split == "tune")
+    salted = [patient_seeds("s", "p", split, 5, "another") for split in ("tune", "test")]
+    assert [salted[0] == tune[:5], salted[1] == test[:5]] == [True, False], "a salt changes the patients of test alone"
 
 
 def test_a_held_out_study_needs_its_own_file_of_seeds(tmp_path: Path) -> None:
     secret, wrong = tmp_path / "secret", tmp_path / "wrong"
-    secret.write_bytes(b"0123456789")
-    wrong.write_bytes(b"9876543210")
+    secret.write_text("0123456789")
+    wrong.write_text("9876543210")
     held_out = study(seeds_sha256="84d89877f0d4041efb6bf91a16f0248f2fd573e6af05c19f96bedb9f882f7882")
     with pytest.raises(StudyError, match="--seeds-file"):
         cases_of(held_out)
@@ -180,20 +172,13 @@ def test_a_held_out_study_needs_its_own_file_of_seeds(tmp_path: Path) -> None:
         secret_of(wrong, held_out)
     hidden = cases_of(held_out, Request(secret=secret_of(secret, held_out)))
     assert {case.seed for case in hidden}.isdisjoint(case.seed for case in cases_of(study()))
-    assert [case.seed for case in cases_of(held_out, Request("tune"))] == [
-        case.seed for case in cases_of(study(), Request("tune"))
-    ]
-
-
-def test_no_patient_at_all_is_refused() -> None:
-    empty = {**TOY["populations"]["clean"], "number": {}}
-    with pytest.raises(StudyError, match=r"number\.test"):
-        cases_of(study(populations={"clean": empty}))
+    usual, same = ([case.seed for case in cases_of(one, Request("tune"))] for one in (study(), held_out))
+    assert same == usual
 
 
 def test_a_folder_holds_the_cases_of_one_request(tmp_path: Path) -> None:
-    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 1))))
-    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 3))))
+    for number in (1, 3):
+        Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", number))))
     poor = cases_of(study(), Request("test", 3, ("errors=poor",)))
     with pytest.raises(StudyError, match="other settings or patients: give another folder with -o"):
         Folder(tmp_path).open(manifest_of("toy", poor))
