@@ -12,10 +12,10 @@ from examination import Finished
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import ViolationKind
+from palpate_bus.messages import nanoseconds
 
 RULES = contract()
 TYPES = {
@@ -39,10 +39,6 @@ def bag(distributed: Finished) -> Iterator[AnyReader]:
 def messages(bag: AnyReader, topic: str) -> list[Any]:
     connections = [connection for connection in bag.connections if connection.topic == topic]
     return [bag.deserialize(raw, connection.msgtype) for connection, _, raw in bag.messages(connections)]
-
-
-def ns(stamp: Any) -> int:
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def test_types_and_qos(bag: AnyReader) -> None:
@@ -104,18 +100,15 @@ def test_tf_is_where_the_described_arm_is_at_its_measured_joints(bag: AnyReader)
     (description,) = messages(bag, "/robot_description")
     model = pin.buildModelFromXML(description.data)
     data = model.createData()
-    states = {ns(state.header.stamp): np.asarray(state.position) for state in messages(bag, "/joint_states")}
+    states = {nanoseconds(state.header.stamp): np.asarray(state.position) for state in messages(bag, "/joint_states")}
     trees = messages(bag, "/tf")
     for tree in trees[:: len(trees) // 20]:
         X = np.eye(4)
         for item in tree.transforms[:11]:
             p, q = item.transform.translation, item.transform.rotation
-            X_PC = np.eye(4)
-            X_PC[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            X_PC[:3, 3] = (p.x, p.y, p.z)
-            X = X @ X_PC
+            X = X @ pin.XYZQUATToSE3(np.array((p.x, p.y, p.z, q.x, q.y, q.z, q.w))).homogeneous
         assert tree.transforms[10].child_frame_id == "indenter"
-        pin.framesForwardKinematics(model, data, states[ns(tree.transforms[0].header.stamp)])
+        pin.framesForwardKinematics(model, data, states[nanoseconds(tree.transforms[0].header.stamp)])
         # The status from which tf is made is a mean over 10 ms, in which the tool moves by some mm at most.
         assert np.linalg.norm(X[:3, 3] - data.oMf[model.getFrameId("indenter")].translation) < 0.01
 
@@ -126,7 +119,7 @@ PACE = {str(kind) for kind in (ViolationKind.AGE, ViolationKind.RATE, ViolationK
 
 def test_diagnostics_name_every_service_and_topic_and_a_sound_run_violates_nothing(bag: AnyReader) -> None:
     arrays = messages(bag, "/diagnostics")
-    stamps = [ns(message.header.stamp) for message in arrays]
+    stamps = [nanoseconds(message.header.stamp) for message in arrays]
     assert all(a < b for a, b in pairwise(stamps))
     for array in arrays:
         names = [status.name for status in array.status]

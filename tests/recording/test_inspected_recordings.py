@@ -41,78 +41,81 @@ def probes(names: str = "plain") -> pd.DataFrame:
     return pd.DataFrame(columns).astype({0: int}).set_axis(list(HEADERS[names]), axis=1)
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "probes.csv"
+
+
+def proposed(file: Path, table: pd.DataFrame) -> tuple[list[str], Path]:
+    """Return the lines and the file of the mapping that is proposed for a table, which is written to `file`."""
+    table.to_csv(file, index=False)
+    return propose(file, file.with_name("mapping.yaml")), file.with_name("mapping.yaml")
+
+
 @pytest.mark.parametrize("writer", HEADERS)
-def test_columns_and_units_are_recognised_by_their_names(writer: str, tmp_path: Path) -> None:
+def test_columns_and_units_are_recognised_by_their_names(writer: str, file: Path) -> None:
     names = HEADERS[writer]
-    probes(writer).to_csv(tmp_path / "probes.csv", index=False)
-    lines = propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
-    mapping = read_mapping(tmp_path / "mapping.yaml")
+    lines, written = proposed(file, probes(writer))
+    mapping = read_mapping(written)
     assert mapping.table is not None
-    assert mapping.table.position == names[1:4]
-    assert mapping.table.force == (names[4:] if "torque x" not in names else names[6:])
-    assert mapping.table.probe == names[0]
+    forces = names[4:] if "torque x" not in names else names[6:]
+    assert (mapping.table.position, mapping.table.force, mapping.table.probe) == (names[1:4], forces, names[0])
     assert (mapping.units.length, mapping.units.force) == ("mm", "N")
     assert any("36 contacts to 3" in line for line in lines)
-    assert ("not sure: units.force: N; the table has no unit" in lines) == ("N" not in names[6])
-    assert len(read_recording(tmp_path / "probes.csv", mapping).touches) == 36
+    assert any("not sure: units.force" in line for line in lines) == ("N" not in names[6])
+    assert len(read_recording(file, mapping).touches) == 36
 
 
-def test_probes_may_have_names_and_yaml_takes_on_for_true(tmp_path: Path) -> None:
+def test_probes_may_have_names_and_yaml_takes_on_for_true(file: Path) -> None:
     table = probes()
-    table.assign(probe="P" + table.probe.astype(str), **{name: -table[name] for name in ("fx", "fy", "fz")}).to_csv(
-        tmp_path / "probes.csv", index=False
-    )
-    (tmp_path / "mapping.yaml").write_text(
+    table[["fx", "fy", "fz"]] *= -1
+    table.assign(probe="P" + table.probe.astype(str)).to_csv(file, index=False)
+    file.with_name("mapping.yaml").write_text(
         "table: {position: [x, y, z], force: [fx, fy, fz], probe: probe}\nunits: {length: mm}\n"
         "force: {on: body}\ntool: {radius_m: 0.01}\n"
     )
-    recording = read_recording(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
+    recording = read_recording(file, file.with_name("mapping.yaml"))
     assert len(recording.touches) == 36
     assert not recording.faults
 
 
-def test_forces_that_may_be_in_kgf_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("scale", "printed"), [(1.0, False), (1 / 9.80665, True)])
+def test_forces_that_may_be_in_kgf_are_named(file: Path, scale: float, printed: bool) -> None:
     table = probes()
-    for scale, printed in ((1.0, False), (1 / 9.80665, True)):
-        table.assign(**{name: scale * table[name] for name in ("fx", "fy", "fz")}).to_csv(tmp_path / "probes.csv", index=False)
-        lines = propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
-        assert any("if the forces are in kgf" in line for line in lines) is printed
+    table[["fx", "fy", "fz"]] *= scale
+    assert any("if the forces are in kgf" in line for line in proposed(file, table)[0]) is printed
 
 
 @pytest.mark.parametrize("written", WRITTEN.values(), ids=WRITTEN)
-def test_tables_of_any_separator_are_read(written: dict[str, str], tmp_path: Path) -> None:
-    table = probes()
-    table.to_csv(tmp_path / "probes.csv", index=False, **written)
-    pd.testing.assert_frame_equal(read_table(tmp_path / "probes.csv"), table, check_dtype=False)
+def test_tables_of_any_separator_are_read(written: dict[str, str], file: Path) -> None:
+    probes().to_csv(file, index=False, **written)
+    pd.testing.assert_frame_equal(read_table(file), probes(), check_dtype=False)
 
 
-def test_a_separator_at_the_end_of_each_row_moves_no_column(tmp_path: Path) -> None:
-    table = probes()
-    table.to_csv(tmp_path / "probes.csv", index=False, lineterminator=",\n")
-    text = (tmp_path / "probes.csv").read_text()
-    (tmp_path / "probes.csv").write_text(text.replace("fz,\n", "fz\n"))
-    assert np.array_equal(read_table(tmp_path / "probes.csv").x, table.x)
+def test_a_separator_at_the_end_of_each_row_moves_no_column(file: Path) -> None:
+    probes().to_csv(file, index=False, lineterminator=",\n")
+    file.write_text(file.read_text().replace("fz,\n", "fz\n"))
+    assert np.array_equal(read_table(file).x, probes().x)
 
 
-def test_a_recording_without_a_map_has_a_report_and_status_2(tmp_path: Path) -> None:
-    probes().iloc[:20].to_csv(tmp_path / "probes.csv", index=False)
-    propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
-    table, mapping, out = (str(tmp_path / name) for name in ("probes.csv", "mapping.yaml", "results"))
-    called = CliRunner().invoke(app_for("assess"), ["assess", table, "--mapping", mapping, "--out", out])
+def test_a_recording_without_a_map_has_a_report_and_status_2(file: Path, tmp_path: Path) -> None:
+    _, mapping = proposed(file, probes().iloc[:20])
+    words = ["assess", str(file), "--mapping", str(mapping), "--out", str(tmp_path / "results")]
+    called = CliRunner().invoke(app_for("assess"), words)
     assert called.exit_code == ExitStatus.BAD_INPUT
     assert "2 of 2 contacts lie on one line" in called.output
     assert "lie on one line" in (tmp_path / "results" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("rows", [0, 1], ids=["header", "one row"])
-def test_too_few_rows_are_one_line(rows: int, tmp_path: Path) -> None:
-    probes().iloc[:rows].to_csv(tmp_path / "probes.csv", index=False)
-    with pytest.raises(UserError, match=r"no numbers|1 usable rows"):
-        propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
-
-
-def test_an_orientation_in_degrees_is_no_quaternion(tmp_path: Path) -> None:
-    table = probes().assign(q0=90.0, q1=0.0, q2=10.0, q3=0.0)
-    table.to_csv(tmp_path / "probes.csv", index=False)
-    with pytest.raises(UserError, match=r"norm is 90\.6"):
-        propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        (probes().iloc[:0], "no numbers"),
+        (probes().iloc[:1], "1 usable rows"),
+        (probes().assign(q0=90.0, q1=0.0, q2=10.0, q3=0.0), r"norm is 90\.6"),
+    ],
+    ids=["header", "one row", "an orientation in degrees"],
+)
+def test_an_unusable_table_is_refused_in_one_line(table: pd.DataFrame, text: str, file: Path) -> None:
+    with pytest.raises(UserError, match=text):
+        proposed(file, table)

@@ -15,21 +15,8 @@ from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Trans
 from palpate.recording.read import read_recording
 from palpate.recording.readings import ReadingError
 from palpate.recording.recording import Contact, ContactKind, loading
-from palpate_bus.messages import (
-    NS,
-    JointState,
-    Point,
-    Pose,
-    PoseStamped,
-    Quaternion,
-    TFMessage,
-    Transform as TransformMessage,
-    TransformStamped,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-    header,
-)
+from palpate_bus import messages as msg
+from palpate_bus.messages import NS, header
 from palpate_bus.messages.typestore import store
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
@@ -61,10 +48,10 @@ def write(
 ) -> None:
     """Poses at 50 Hz, wrenches at 100 Hz in the axes of a tool that is turned about z, with its weight."""
     turn = Rotation.from_euler("z", 0.7)
-    q = Quaternion(*(turn.as_quat() if oriented else np.zeros(4)))
+    q = msg.Quaternion(*(turn.as_quat() if oriented else np.zeros(4)))
     weighed = turn.inv().apply(table[["fx", "fy", "fz"]].to_numpy() + np.array((0.0, 0.0, -9.81 * TOOL.mass_kg)))
     with Writer(folder, version=9, storage_plugin=plugin) as bag:
-        types = {"/wrench": WrenchStamped, "/tool_pose": PoseStamped, "/tf": TFMessage, "/joints": JointState}
+        types = {"/wrench": msg.WrenchStamped, "/tool_pose": msg.PoseStamped, "/tf": msg.TFMessage, "/joints": msg.JointState}
         topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}
 
         def send(name: str, message: object, t: int) -> None:
@@ -72,30 +59,32 @@ def write(
 
         for k, (row, force) in enumerate(zip(table.itertuples(), weighed, strict=True)):
             t = round((row.t + 1000) * NS)
-            send("/wrench", WrenchStamped(header(stamp(t), "tool"), Wrench(Vector3(*force), Vector3(0.0, 0.0, 0.0))), t)
+            wrench = msg.Wrench(msg.Vector3(*force), msg.Vector3(0.0, 0.0, 0.0))
+            send("/wrench", msg.WrenchStamped(header(stamp(t), "tool"), wrench), t)
             if k % 2 == 0:
                 p = (row.x, row.y, row.z)
-                send("/tool_pose", PoseStamped(header(stamp(t), "world"), Pose(Point(*p), q)), t)
-                send("/tf", TFMessage([TransformStamped(header(t, "world"), "tool", TransformMessage(Vector3(*p), q))]), t)
+                send("/tool_pose", msg.PoseStamped(header(stamp(t), "world"), msg.Pose(msg.Point(*p), q)), t)
+                transform = msg.TransformStamped(header(t, "world"), "tool", msg.Transform(msg.Vector3(*p), q))
+                send("/tf", msg.TFMessage([transform]), t)
                 names = list("xyz" if k % 4 else "zxy")  # the order changes
                 q_now = np.array([getattr(row, name) for name in names])
-                send("/joints", JointState(header(t), names, q_now, np.empty(0), np.empty(0)), t)
+                send("/joints", msg.JointState(header(t), names, q_now, np.empty(0), np.empty(0)), t)
+
+
+def mapped(pose: object = "/tool_pose", **fields: object) -> Mapping:
+    return Mapping.model_validate({"topics": Topics.model_validate({"wrench": "/wrench", "pose": pose}), "tool": TOOL, **fields})
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 @pytest.mark.parametrize("pose", POSES)
 def test_a_bag_gives_the_contacts_of_its_table(few: pd.DataFrame, tmp_path: Path, pose: str, plugin: StoragePlugin) -> None:
-    folder = tmp_path / "bag"
-    write(folder, few, plugin)
+    write(tmp_path / "bag", few, plugin)
     (tmp_path / "gantry.urdf").write_text(SLIDERS)
-    yaw = 0.7 if pose == "joints" else 0.0
     source = POSES[pose]
     if isinstance(source, Joints):
         source = source.model_copy(update={"urdf": tmp_path / "gantry.urdf"})
-    mapping = Mapping.model_validate(
-        {"topics": Topics(wrench="/wrench", pose=source), "tool": TOOL, "force": {"axes": "tool", "rpy_rad": (0, 0, yaw)}}
-    )
-    recording = read_recording(folder, mapping)
+    yaw = 0.7 if pose == "joints" else 0.0
+    recording = read_recording(tmp_path / "bag", mapped(source, force={"axes": "tool", "rpy_rad": (0, 0, yaw)}))
     assert not recording.faults
     assert len(recording.touches) == 9
     assert abs(recording.depth_m - 0.010) < 0.0008
@@ -114,27 +103,22 @@ def test_stamps_that_repeat_are_replaced_by_the_times_of_the_log(
     few: pd.DataFrame, tmp_path: Path, stamp: Callable[[int], int], logged: Callable[[int], int]
 ) -> None:
     write(tmp_path / "bag", few, StoragePlugin.MCAP, stamp, logged)
-    mapping = Mapping.model_validate(
-        {"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL, "force": {"axes": "tool"}}
-    )
-    recording = read_recording(tmp_path / "bag", mapping)
+    recording = read_recording(tmp_path / "bag", mapped(force={"axes": "tool"}))
     assert not recording.faults
     assert len(recording.touches) == 9
 
 
 def test_poses_without_an_orientation_are_positions(few: pd.DataFrame, tmp_path: Path) -> None:
     write(tmp_path / "bag", few, StoragePlugin.MCAP, oriented=False)
-    fields = {"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL}
-    assert len(read_recording(tmp_path / "bag", Mapping.model_validate(fields)).touches) == 9
-    with pytest.raises(ReadingError, match="the recording has no orientation"):
-        read_recording(tmp_path / "bag", Mapping.model_validate({**fields, "force": {"axes": "tool"}}))
+    assert len(read_recording(tmp_path / "bag", mapped()).touches) == 9
+    with pytest.raises(ReadingError, match="no orientation"):
+        read_recording(tmp_path / "bag", mapped(force={"axes": "tool"}))
 
 
 def test_a_bag_without_messages_is_refused(few: pd.DataFrame, tmp_path: Path) -> None:
     write(tmp_path / "bag", few[:0], StoragePlugin.MCAP)
-    mapping = Mapping.model_validate({"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL})
     with pytest.raises(ReadingError, match="0 poses; expected at least 2"):
-        read_recording(tmp_path / "bag", mapping)
+        read_recording(tmp_path / "bag", mapped())
 
 
 def pressed(depth: np.ndarray, force: np.ndarray, noise: float) -> Contact:

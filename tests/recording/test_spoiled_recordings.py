@@ -18,11 +18,11 @@ from palpate_assessment.places import places_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))
+G = 9.80665
 P, F, N, Q = ["x", "y", "z"], ["fx", "fy", "fz"], ["nx", "ny", "nz"], ["qx", "qy", "qz", "qw"]
-OVER_TIME = Mapping(table=MappedColumns(position=tuple(P), force=tuple(F), time="t"), tool=MappedTool(radius_m=0.015))
-PROBES = Mapping(
-    table=MappedColumns(position=tuple(P), force=tuple(F), normal=tuple(N), probe="probe"), tool=MappedTool(radius_m=0.015)
-)
+TABLE, TOOL = MappedColumns(position=tuple(P), force=tuple(F), time="t"), MappedTool(radius_m=0.015)
+OVER_TIME = Mapping(table=TABLE, tool=TOOL)
+PROBES = Mapping(table=TABLE.model_copy(update={"time": None, "normal": tuple(N), "probe": "probe"}), tool=TOOL)
 
 
 @pytest.fixture(scope="module")
@@ -132,10 +132,7 @@ MAPPED = {
     "20-hz": (lambda t: resampled(t, 20), OVER_TIME),
     "500-hz": (lambda t: resampled(t, 500), OVER_TIME),
     "millimetres": (scaled(P, 1e3), mapped(OVER_TIME, units=Units(length="mm"))),
-    "centimetres-kgf": (
-        lambda t: scaled(F, 1 / 9.80665)(scaled(P, 100)(t)),
-        mapped(OVER_TIME, units=Units(length="cm", force="kgf")),
-    ),
+    "centimetres-kgf": (lambda t: scaled(F, 1 / G)(scaled(P, 100)(t)), mapped(OVER_TIME, units=Units(length="cm", force="kgf"))),
     "dates": (lambda t: t.assign(t=(pd.Timestamp("2026-01-01") + pd.to_timedelta(t.t, unit="s")).astype(str)), OVER_TIME),
     "on-the-body": (scaled(F, -1), mapped(OVER_TIME, force=ForceSource(on="body"))),
     "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=MappedTool(radius_m=0.015, point="tip"))),
@@ -175,8 +172,8 @@ SPOILED = {
     "grazing": (grazing, OVER_TIME, C.SHALLOW),
     "holes": (lambda t: t.assign(fz=t.fz.where(np.arange(len(t)) % 50 != 7)), OVER_TIME, C.INVALID),
     "millinewtons": (scaled(F, 1e-3), mapped(OVER_TIME, units=Units(force="mN")), C.FORCE_UNIT),
-    "grams": (scaled(F, 1 / 9.80665e-3), OVER_TIME, C.FORCE_UNIT),
-    "probes-grams": (scaled(F, 1 / 9.80665e-3), PROBES, C.FORCE_UNIT),
+    "grams": (scaled(F, 1 / (G / 1000)), OVER_TIME, C.FORCE_UNIT),
+    "probes-grams": (scaled(F, 1 / (G / 1000)), PROBES, C.FORCE_UNIT),
     "two-tools": (of_two_tools, OVER_TIME, C.TWO_TOOLS),
     "probes-one-x": (lambda t: t.assign(x=0.0), PROBES, C.LINE),
     "probes-inward": (scaled(N, -1), PROBES, C.NORMALS),
@@ -186,8 +183,8 @@ SPOILED = {
     "noise": (lambda t: t.assign(**{name: np.random.default_rng(0).normal(0, 1, len(t)) for name in F}), OVER_TIME, C.FRAME),
     "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
     "header-again": (header_again, OVER_TIME, C.INVALID),
-    "kilograms": (scaled(F, 1 / 9.80665), OVER_TIME, C.STIFFNESS),
-    "probes-kilograms": (scaled(F, 1 / 9.80665), PROBES, C.STIFFNESS),
+    "kilograms": (scaled(F, 1 / G), OVER_TIME, C.STIFFNESS),
+    "probes-kilograms": (scaled(F, 1 / G), PROBES, C.STIFFNESS),
     "centimetres-as-millimetres": (scaled(P, 100), mapped(OVER_TIME, units=Units(length="mm")), C.STIFFNESS),
     "minutes": (lambda t: t.assign(t=t.t / 60), OVER_TIME, C.SPEED),
     "milliseconds": (lambda t: t.assign(t=1e3 * t.t), OVER_TIME, C.TIME_UNIT),
@@ -236,17 +233,13 @@ def test_a_fault_is_named_and_adds_no_finding(
 
 def test_slides_over_a_body_that_breathes_keep_one_depth() -> None:
     """The tool follows the skin, which rises and falls by 4 mm, 10 mm deep along lines that are 12 mm apart."""
-    rows = []
-    for line in range(6):
-        depth = np.concatenate((np.linspace(-15, 10, 60), np.full(450, 10.0), np.linspace(10, -15, 40)))
-        along = np.concatenate((np.zeros(110), np.linspace(0, 90, 360), np.full(80, 90.0)))
-        rows.append(np.column_stack((along, np.full(550, 12.0 * line), -depth)))
-    x, y, z = 1e-3 * np.concatenate(rows).T
-    time = 0.01 * np.arange(len(x))
-    depth = np.maximum(-z, 0)
-    rng = np.random.default_rng(0)
-    position = np.column_stack((x, y, z + 0.015 + 0.004 * np.sin(2 * np.pi * time / 4.3)))
-    force = np.column_stack((0 * x, 0 * x, 3e3 * depth**1.5)) + rng.normal(0, 0.02, (len(x), 3))
+    steps = np.arange(550)
+    depth = np.tile(np.interp(steps, (0, 59, 510, 549), (-0.015, 0.010, 0.010, -0.015)), 6)
+    x = np.tile(np.interp(steps, (110, 469), (0, 0.090)), 6)
+    y, time = 0.012 * np.repeat(np.arange(6), 550), 0.01 * np.arange(6 * 550)
+    position = np.column_stack((x, y, 0.015 - depth + 0.004 * np.sin(2 * np.pi * time / 4.3)))
+    force = np.random.default_rng(0).normal(0, 0.02, (len(x), 3))
+    force[:, 2] += 3e3 * np.maximum(depth, 0) ** 1.5
     recording = recording_of(Readings(position, force, time), OVER_TIME, "breathing")
     assert [fault.code for fault in recording.faults] == [FaultCode.MOVES]
     assert abs(recording.depth_m - 0.010) < 0.002
