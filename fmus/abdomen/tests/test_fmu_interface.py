@@ -1,6 +1,7 @@
 """The FMU as importers see it: description, values, errors, rollback."""
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import fmpy
@@ -53,20 +54,14 @@ def test_every_name_of_fmi_2_is_in_its_grammar(tmp_path: Path) -> None:
 
 def test_every_real_number_has_a_unit_and_what_can_be_set_has_bounds(fmu: Path) -> None:
     for v in fmpy.read_model_description(str(fmu)).modelVariables:
-        if v.type in ("Real", "Float64"):
-            assert v.unit, v.name
-        if v.causality in ("input", "parameter"):
-            assert v.min is not None, v.name
-            assert v.max is not None, v.name
+        assert v.unit or v.type not in ("Real", "Float64"), v.name
+        assert None not in (v.min, v.max) or v.causality not in ("input", "parameter"), v.name
 
 
 def test_value_references_do_not_overlap() -> None:
-    used: list[range] = []
-    for v in TABLE:
-        scalars = 2 in v.versions  # FMI 3.0 has one for an array
-        own = range(v.vr, v.vr + (v.count(Sizes(vertices=4_000_000, triangles=1, samples=400, branches=4)) if scalars else 1))
-        assert not any(own.start < other.stop and other.start < own.stop for other in used), v.name
-        used.append(own)
+    sizes = Sizes(vertices=4_000_000, triangles=1, samples=400, branches=4)
+    scalars = [(v.vr, v.count(sizes) if 2 in v.versions else 1) for v in TABLE]  # FMI 3.0 has one for an array
+    assert all(vr + count <= following for (vr, count), (following, _) in pairwise(sorted(scalars)))
 
 
 def test_both_versions_give_the_same_numbers(fmu2: Path, fmu3: Path) -> None:
@@ -75,37 +70,23 @@ def test_both_versions_give_the_same_numbers(fmu2: Path, fmu3: Path) -> None:
         np.testing.assert_array_equal(forces, press(newer))
         assert np.abs(forces[:, 2]).max() > 1
         sample = older.get("sample_displacement")
-        index = [
-            int(np.linalg.norm(newer.get("rest_position") - place, axis=1).argmin()) for place in older.get("sample_position")
-        ]
+        places = newer.get("rest_position")
+        index = [int(np.linalg.norm(places - place, axis=1).argmin()) for place in older.get("sample_position")]
         np.testing.assert_array_equal(sample, newer.get("surface_displacement")[index])
         assert len(set(index)) == len(index) == 64
-        for name in (
-            "indentation_depth",
-            "normal_force",
-            "tangential_force",
-            "contacts",
-            "elastic_energy",
-            "breathing_excursion",
-        ):
-            assert older.get(name) == newer.get(name), name
+        scalars = ("indentation_depth", "normal_force", "tangential_force", "contacts", "elastic_energy", "breathing_excursion")
+        assert [older.get(name) for name in scalars] == [newer.get(name) for name in scalars]
 
 
 def test_what_can_be_read_is_what_was_exported(fmu3: Path, phantom: Phantom) -> None:
     model = build_phantom(phantom, 1)
     with FmuInstance(fmu3) as fmu:
-        for name, array in (
-            ("rest_position", model.vertices),
-            ("rest_normal", model.normals),
-            ("background", model.background),
-            ("lesion", model.lesion),
-            ("triangles", model.triangles),
-        ):
-            np.testing.assert_array_equal(fmu.get(name), array)
+        np.testing.assert_array_equal(fmu.get("rest_position"), model.vertices)
+        np.testing.assert_array_equal(fmu.get("rest_normal"), model.normals)
+        for name in ("background", "lesion", "triangles"):
+            np.testing.assert_array_equal(fmu.get(name), getattr(model, name))
         np.testing.assert_allclose(fmu.get("stiffness"), model.stiffness, rtol=1e-13)
-        for v in TABLE:
-            if v.kind is VariableKind.FIXED and 3 in v.versions:
-                assert np.isfinite(fmu.get(v.name)).all()
+        assert all(np.isfinite(fmu.get(v.name)).all() for v in TABLE if v.kind is VariableKind.FIXED and 3 in v.versions)
 
 
 def test_lesions_are_parameters(fmu3: Path, phantom: Phantom) -> None:
@@ -113,9 +94,8 @@ def test_lesions_are_parameters(fmu3: Path, phantom: Phantom) -> None:
     moved = phantom.model_copy(update={"lesions": (lesion.model_copy(update={"centre_m": (0.04, 0.02), "contrast": 6.0}),)})
     centre = np.zeros((8, 2))
     centre[0] = (0.04, 0.02)
-    with FmuInstance(
-        fmu3, values={"lesion_centre": centre, "lesion_contrast": [6.0, *[1.0] * 7], "stiffness_scale": 1.25}
-    ) as fmu:
+    values = {"lesion_centre": centre, "lesion_contrast": [6.0, *[1.0] * 7], "stiffness_scale": 1.25}
+    with FmuInstance(fmu3, values=values) as fmu:
         model = build_phantom(moved, 1)
         np.testing.assert_allclose(fmu.get("stiffness"), 1.25 * model.stiffness, rtol=1e-13)
         np.testing.assert_array_equal(fmu.get("lesion"), model.lesion)
@@ -142,8 +122,8 @@ def test_a_bad_value_or_step_is_refused_with_a_message_and_nothing_changes(fmu: 
     with FmuInstance(fmu) as one, FmuInstance(fmu) as other:
         press(one)
         press(other)
+        before = one.get("indenter_position")
         for name, value, words in BAD_VALUES:
-            before = one.get("indenter_position")
             with pytest.raises(FmuError, match="Error") as caught:
                 one.set(name, value)
             assert all(word in str(caught.value) for word in words), (name, value)
@@ -163,30 +143,26 @@ def test_parameters_that_disagree_are_refused(fmu: Path) -> None:
         FmuInstance(fmu, values={"dashpot": 1e-4})
 
 
+CALLS = {
+    2: ("getFMUstate", "serializeFMUstate", "freeFMUstate", "deSerializeFMUstate", "setFMUstate"),
+    3: ("getFMUState", "serializeFMUState", "freeFMUState", "deserializeFMUState", "setFMUState"),
+}
+"""FMPy's names in FMI 2.0 and 3.0."""
+
+
 def save(instance: FmuInstance) -> bytes:
-    """Return the state of the FMU, serialised, by FMPy's names of FMI 2.0 and 3.0."""
-    fmu = instance._fmu
-    get, serialize, free = (
-        ("getFMUstate", "serializeFMUstate", "freeFMUstate")
-        if instance.version == 2
-        else ("getFMUState", "serializeFMUState", "freeFMUState")
-    )
-    state = getattr(fmu, get)()
-    saved = bytes(getattr(fmu, serialize)(state))
-    getattr(fmu, free)(state)
+    get, serialize, free, *_ = (getattr(instance._fmu, name) for name in CALLS[instance.version])
+    state = get()
+    saved = bytes(serialize(state))
+    free(state)
     return saved
 
 
 def restore(instance: FmuInstance, saved: bytes) -> None:
-    fmu = instance._fmu
-    deserialize, set_state, free = (
-        ("deSerializeFMUstate", "setFMUstate", "freeFMUstate")
-        if instance.version == 2
-        else ("deserializeFMUState", "setFMUState", "freeFMUState")
-    )
-    state = getattr(fmu, deserialize)(saved)
-    getattr(fmu, set_state)(state)
-    getattr(fmu, free)(state)
+    *_, free, deserialize, set_state = (getattr(instance._fmu, name) for name in CALLS[instance.version])
+    state = deserialize(saved)
+    set_state(state)
+    free(state)
 
 
 def test_a_state_can_be_saved_and_loaded_even_by_another_instance(fmu: Path) -> None:
