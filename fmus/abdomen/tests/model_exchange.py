@@ -31,12 +31,8 @@ class Exchange:
         self.older = description.fmiVersion == "2.0"
         self.variables = read_variables(description)
         kind = fmi2.FMU2Model if self.older else fmi3.FMU3Model
-        self.fmu: Any = kind(
-            guid=description.guid,
-            unzipDirectory=self.folder,
-            modelIdentifier=description.modelExchange.modelIdentifier,
-            instanceName="x",
-        )
+        model = description.modelExchange.modelIdentifier
+        self.fmu: Any = kind(guid=description.guid, unzipDirectory=self.folder, modelIdentifier=model, instanceName="x")
         self.fmu.instantiate()
         for name, value in (values or {}).items():
             self.set(name, np.atleast_1d(value))
@@ -101,12 +97,9 @@ class Exchange:
 
     def derivative(self, unknowns: list[str], knowns: dict[str, Array]) -> dict[str, Array]:
         """Return the directional derivative of some variables along a direction of others."""
-        seed = np.concatenate([np.ravel(value) for value in knowns.values()]).astype(float)
+        seed = np.concatenate([np.ravel(value) for value in knowns.values()]).astype(float).tolist()
+        known, unknown = ([r for name in names for r in self.variables[name].references] for names in (knowns, unknowns))
         sizes = [self.variables[name].size for name in unknowns]
-        known = [r for name in knowns for r in self.variables[name].references]
-        unknown = [r for name in unknowns for r in self.variables[name].references]
-        if self.older:
-            found = np.array(self.fmu.getDirectionalDerivative(unknown, known, seed.tolist()))
-        else:
-            found = np.array(self.fmu.getDirectionalDerivative(unknown, known, seed.tolist(), sum(sizes)))
+        more = () if self.older else (sum(sizes),)
+        found = np.array(self.fmu.getDirectionalDerivative(unknown, known, seed, *more))
         return dict(zip(unknowns, np.split(found, np.cumsum(sizes)[:-1]), strict=True))
