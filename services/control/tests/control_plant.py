@@ -1,6 +1,7 @@
 """A plant for the controller's tests: the arm on pinocchio, with joint friction, stepped at 1 kHz, and a contact."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -62,31 +63,15 @@ class Plant:
         self.qd = np.linalg.solve(left, right)
         self.q = self.q + DT * self.qd
 
-    def energy(self) -> float:
-        """Kinetic energy [J]."""
-        return 0.5 * float(self.qd @ pin.crba(self.model, self.data, self.q) @ self.qd)
 
-
-def setpoint(
-    arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: ControlMode = ControlMode.CARTESIAN, **changes: object
-) -> Setpoint:
+def setpoint(arm: ArmModel, at: Any, stamp: int = 0, mode: ControlMode = ControlMode.CARTESIAN, **changes: Any) -> Setpoint:
     """Return a set-point that holds posture `at`, with `changes`."""
-    rest = np.zeros(arm.joints)
-    arm.update(np.asarray(at, dtype=float), rest)
-    fields: dict[str, object] = {
-        "mode": mode,
-        "stamp": stamp,
-        "R_WD": arm.R_WI.copy(),
-        "p_WD": arm.p_WI.copy(),
-        "V_WD": np.zeros(6),
-        "F_W": np.zeros(6),
-        "stiffness": np.array([2000.0, 2000.0, 5000.0, 200.0, 200.0, 200.0]),
-        "damping_ratio": np.full(6, 0.8),
-        "q": np.array(at, dtype=float),
-        "qd": rest,
-        "joint_stiffness": np.full_like(rest, 20.0 if mode is ControlMode.CARTESIAN else 500.0),
-    }
-    return Setpoint(**(fields | changes))  # type: ignore[arg-type]
+    q, rest, none = np.array(at, dtype=float), np.zeros(arm.joints), np.zeros(6)
+    arm.update(q, rest)
+    K, zeta = np.array([2000.0, 2000.0, 5000.0, 200.0, 200.0, 200.0]), np.full(6, 0.8)
+    K_0 = np.full_like(rest, 20.0 if mode is ControlMode.CARTESIAN else 500.0)
+    held = Setpoint(stamp, mode, arm.R_WI.copy(), arm.p_WI.copy(), none, none.copy(), K, zeta, q, rest, K_0)
+    return held._replace(**changes)
 
 
 def reference(setpoint_: Setpoint, t: int = 0) -> Reference:

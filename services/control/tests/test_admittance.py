@@ -1,6 +1,7 @@
 """Admittance control: the static law, the tare, and the limits of what it commands."""
 
 from math import acos
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,13 +31,14 @@ class Contact:
         self.law = AdmittanceController(self.model, lbr.ARM, MASS)
         self.t = 0
 
-    def follow(self, mode: ControlMode, force_W: np.ndarray, ticks: int = SETTLED, **changes: object) -> np.ndarray:
-        """Return where the tool is [m] after some ticks under a force on it [N]."""
+    def follow(self, mode: ControlMode, force_W: np.ndarray, ticks: int = SETTLED, held: bool = False, **changes: Any) -> Any:
+        """Return where the tool is [m] after some ticks under a force on it [N]; a driver that holds it ignores the commands."""
         asked = setpoint(self.model, self.asked, mode=mode, **changes)
         for _ in range(ticks):
             self.t += MS
-            self.law.sense(self.tool()[1].T @ (force_W - (0, 0, MASS * GRAVITY)) + BIAS)
-            self.q = self.law.command(self.q, REST, reference(asked, self.t))
+            self.law.sense(self.tool()[1].T @ (force_W - (0, 0, MASS * GRAVITY)) + BIAS, commanded=not held)
+            command = self.law.command(self.q, REST, reference(asked, self.t))
+            self.q = self.q if held else command
         return self.tool()[0]
 
     def tool(self) -> tuple[np.ndarray, np.ndarray]:
@@ -59,11 +61,7 @@ def test_at_rest_the_tool_yields_by_force_over_stiffness(posture: int) -> None:
 def test_an_arm_that_its_driver_holds_in_contact_takes_no_bias() -> None:
     contact = Contact()
     start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)
-    asked = setpoint(contact.model, contact.asked, mode=ControlMode.JOINT)
-    for _ in range(SETTLED):
-        contact.t += MS
-        contact.law.sense(contact.tool()[1].T @ (PUSH - (0, 0, MASS * GRAVITY)) + BIAS, commanded=False)
-        contact.law.command(contact.q, REST, reference(asked, contact.t))
+    contact.follow(ControlMode.JOINT, PUSH, held=True)
     np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, np.zeros(3)), start, atol=2e-5)
 
 

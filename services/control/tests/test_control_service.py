@@ -34,17 +34,11 @@ def joints(t: int, q: np.ndarray = HOME, names: tuple[str, ...] = JOINT_NAMES) -
 
 
 def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_JOINT, **changes: Any) -> Any:
-    fields = {
-        "mode": mode,
-        "pose": Pose(Point(0.3, 0.0, 1.5), Quaternion(1.0, 0.0, 0.0, 0.0)),
-        "stiffness": np.full(6, 200.0),
-        "damping_ratio": np.full(6, 0.8),
-        "joint_position": np.array(HOME) + 0.1,
-        "joint_velocity": np.zeros(7),
-        "joint_stiffness": np.full(7, 500.0),
-        "valid_for": duration_message(valid),
-    }
-    return replace(blank("palpation_msgs/msg/ImpedanceSetpoint", t, "world"), **(fields | changes))
+    pose = Pose(Point(0.3, 0.0, 1.5), Quaternion(1.0, 0.0, 0.0, 0.0))
+    joints = {"joint_position": np.array(HOME) + 0.1, "joint_velocity": np.zeros(7), "joint_stiffness": np.full(7, 500.0)}
+    axes = {"stiffness": np.full(6, 200.0), "damping_ratio": np.full(6, 0.8)}
+    fields = {"mode": mode, "pose": pose, "valid_for": duration_message(valid), **axes, **joints, **changes}
+    return replace(blank("palpation_msgs/msg/ImpedanceSetpoint", t, "world"), **fields)
 
 
 def status(t: int) -> Any:
@@ -84,46 +78,33 @@ def valid_for(command: Any) -> int:
     return nanoseconds(command.valid_for)
 
 
-def test_zero_torque_before_the_first_setpoint(rig: Rig) -> None:
-    for command in (rig.service.step(0, rig.inbox)["control/joint_torque"], rig.tick(5)):
-        np.testing.assert_array_equal(command.torque, 0.0)
-        assert valid_for(command) == EXPIRY
-
-
 def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
     rig.send(setpoint(0, valid=100 * MS))
     command = rig.tick(101)
     assert (valid_for(command), command.problem) == (EXPIRY, "")
     command = rig.tick()
-    assert (valid_for(command), command.problem) == (0, "the last planning/setpoint expired 1 ms ago")
+    assert (valid_for(command), command.culprit) == (0, "planning/setpoint")
     np.testing.assert_array_equal(command.torque, 0.0)
     assert valid_for(rig.tick(30)) == 0
     assert rig.service.finish()["ticks_without_command"] == 31
 
 
 @pytest.mark.parametrize("state", [{"names": JOINT_NAMES[::-1]}, {"q": HOME[:6]}], ids=["permuted", "one too few"])
-def test_joints_of_another_arm_end_commanding(rig: Rig, state: dict[str, Any]) -> None:
+def test_joints_of_another_arm_end_commanding_and_its_setpoints_are_refused(rig: Rig, state: dict[str, Any]) -> None:
     rig.tick()
     rig.send(setpoint(rig.t))
     assert valid_for(rig.tick(5)) > 0
-    command = rig.tick(**state)
-    assert valid_for(command) == 0
-    assert command.culprit == "joint_states"
-
-
-def test_a_long_wait_for_the_first_setpoint_is_stated(rig: Rig) -> None:
-    assert rig.tick(250).problem == ""
-    command = rig.tick(2)
-    assert command.culprit == "planning/setpoint"
-    assert valid_for(command) == EXPIRY
-    np.testing.assert_array_equal(command.torque, 0.0)
-
-
-def test_a_setpoint_for_another_arm_is_refused(rig: Rig) -> None:
-    rig.tick()
     rig.send(setpoint(rig.t, joint_position=HOME[:6]))
-    rig.tick(5)
+    command = rig.tick(**state)
+    assert (valid_for(command), command.culprit) == (0, "joint_states")
     assert rig.service.finish()["setpoints_rejected"] == 1
+
+
+def test_before_the_first_setpoint_torque_is_zero_and_a_long_wait_is_stated(rig: Rig) -> None:
+    for ticks, culprit in ((250, ""), (2, "planning/setpoint")):
+        command = rig.tick(ticks)
+        assert (valid_for(command), command.culprit) == (EXPIRY, culprit)
+        np.testing.assert_array_equal(command.torque, 0.0)
 
 
 @pytest.mark.parametrize("level", [CommandLevel.TORQUE, CommandLevel.POSITION])
@@ -133,7 +114,6 @@ def test_a_cartesian_setpoint_far_from_the_tool_ends_commanding(level: CommandLe
     command = rig.tick(20)
     assert valid_for(command) == 0
     assert command.culprit == "planning/setpoint"
-    assert "m from the tool, limit 0.1 m" in command.problem
 
 
 def test_no_setpoint_outlives_the_contract(rig: Rig) -> None:
@@ -169,7 +149,7 @@ def test_while_joint_states_are_stale_the_last_torque_stands_no_longer_than_it_w
         command = rig.service.step(late + ms * MS, rig.inbox)["control/joint_torque"]
         assert valid_for(command) == EXPIRY - ms * MS
         assert command.torque == pytest.approx(last.torque)
-        assert "joint_states" in command.problem
+        assert command.culprit == "joint_states"
     ceased = rig.service.step(late + EXPIRY, rig.inbox)["control/joint_torque"]
     assert valid_for(ceased) == 0
     assert not ceased.torque.any()
@@ -232,8 +212,7 @@ def test_a_state_that_comes_again_and_again_winds_no_spring_up(rig: Rig) -> None
             rig.send(setpoint(rig.t, joint_position=moving(rig.t)))
         command = rig.tick(1, message=frozen)
     assert not command.torque.any()
-    assert valid_for(command) <= 0
-    assert "joint_states" in command.problem
+    assert (valid_for(command), command.culprit) == (0, "joint_states")
 
 
 def test_nothing_is_compiled_in_mid_run(rig: Rig) -> None:
@@ -254,7 +233,7 @@ def test_a_setpoint_of_the_far_future_is_refused_and_holds_up_no_other(rig: Rig)
     before = rig.tick(20).torque[0]
     rig.send(setpoint(rig.t + 3_600_000 * MS))
     rig.tick()
-    assert "ms ahead, limit 250 ms" in rig.service.finish()["problem"]
+    assert rig.service.finish()["setpoints_rejected"] == 1
     rig.send(setpoint(rig.t, joint_position=np.array(HOME) - 0.1))
     command = rig.tick(40)
     assert valid_for(command) == EXPIRY
