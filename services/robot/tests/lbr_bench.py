@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_message, header
+from palpate_bus.messages.geometry import vector
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel
@@ -65,8 +66,7 @@ class DirectPort(ArmPort):
         return others
 
     def contact(self, wrench: Any) -> None:
-        f, m = wrench.wrench.force, wrench.wrench.torque
-        self.emulator.force_W[:], self.emulator.moment_W[:] = (f.x, f.y, f.z), (m.x, m.y, m.z)
+        self.emulator.force_W[:], self.emulator.moment_W[:] = vector(wrench.wrench.force), vector(wrench.wrench.torque)
 
     def physics(self) -> tuple[Any | None, Any | None]:
         moved, self._moved = self._moved, False
@@ -92,8 +92,6 @@ class Rig:
     """Driver, emulated arm, and a joint servo that commands it."""
 
     def __init__(self, **options: Any) -> None:
-        self.driver: HardwareService
-        self.port: DirectPort
         self.driver, self.port = driver_on_emulator(SCENARIO, **options)
         self.inbox = HandInbox()
         self.t = -MS

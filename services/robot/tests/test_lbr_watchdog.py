@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from lbr_bench import MS, Rig, active_rig, driver_on_emulator
 
 from palpate.run.composed import load_services
-from palpate_bus.messages import ExamState, RobotStatus, SupervisorState, header, nanoseconds
+from palpate_bus.messages import ExamState, RobotStatus, blank, nanoseconds
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -110,10 +111,7 @@ def rig() -> Rig:
 
 
 def release(rig: Rig) -> None:
-    state: Any = SupervisorState(
-        **{**dict.fromkeys(SupervisorState.__dataclass_fields__, 0), "header": header(rig.t), "releases": 1, "culprit": ""}
-    )
-    rig.inbox.events["supervisor/state"] = [state]
+    rig.inbox.events["supervisor/state"] = [replace(blank("palpation_msgs/msg/SupervisorState", rig.t), releases=1)]
     rig.tick(20)
 
 

@@ -7,6 +7,7 @@ import pytest
 from lbr_bench import Rig
 from scipy.spatial.transform import Rotation
 
+from palpate_bus.messages.geometry import vector
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
@@ -18,7 +19,7 @@ from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.dart.service import create
 from palpate_robot.backends.lbr.emulator import Emulator
 from palpate_robot.backends.mujoco.plant import MujocoPlant
-from palpate_robot.plant import DT, Plant
+from palpate_robot.plant import DT
 from palpate_robot.sensors import SENSORS, FtSensor, JointSensor
 
 QUIET: dict[str, float] = {"noise_n": 0.0, "noise_nm": 0.0, "bias_n": 0.0, "bias_nm": 0.0}
@@ -56,27 +57,19 @@ def test_white_noise_and_bias_have_the_size_that_is_said() -> None:
     assert np.abs(lag_one).max() < 0.06
 
 
-def test_an_ideal_sensor_reads_the_truth() -> None:
-    np.testing.assert_array_equal(readings(force(), 3, wrench=WRENCH), [WRENCH] * 3)
-
-
 def test_gain_and_cross_talk_appear_in_readings() -> None:
+    np.testing.assert_array_equal(readings(force(), 3, wrench=WRENCH), [WRENCH] * 3)
     drawn = force(gain=0.05, cross_talk=0.02)
     (found,) = readings(drawn, 1, wrench=WRENCH)
     np.testing.assert_allclose(found, drawn.sensitivity @ WRENCH)
     assert abs(found[2] - WRENCH[2]) > 0.05
-    only_gain = force(gain=0.05)
-    (found,) = readings(only_gain, 1, wrench=(0.0, 0.0, 10.0, 0.0, 0.0, 0.0))
-    assert found[2] == pytest.approx(10.0 * only_gain.sensitivity[2, 2])
-    assert found[2] != pytest.approx(10.0, abs=0.01)
-    np.testing.assert_array_equal(np.delete(found, 2), np.zeros(5))
 
 
 def test_tares_differ_by_the_wander_and_it_forgets() -> None:
     size = force(tare_n=0.3, tare_s=500.0)
     tares = np.array([readings(size, 1, seed=seed)[0] for seed in range(400)])
     np.testing.assert_allclose(tares.std(axis=0), 0.3 * np.repeat((1.0, MOMENT_PER_FORCE_M), 3), rtol=0.15)
-    path = readings(size, 600_000, period_s=0.1)[::1000] / np.repeat((1.0, MOMENT_PER_FORCE_M), 3)  # every 100 s
+    path = readings(size, 300_000, period_s=0.1)[::1000] / np.repeat((1.0, MOMENT_PER_FORCE_M), 3)  # every 100 s
     lags = [np.mean(path[lag:] * path[:-lag]) / np.mean(path**2) for lag in (1, 5, 30)]
     np.testing.assert_allclose(lags, np.exp(np.array((-0.2, -1.0, -6.0))), atol=0.12)
 
@@ -121,7 +114,7 @@ def test_measured_velocity_is_the_derivative_of_measured_position() -> None:
     for k in range(1, 300):
         joints.update(lbr.HOME + v * k * DT, v, np.full(7, 20.0 * np.sin(0.01 * k)))
         path.append((joints.q, joints.v))
-    q, speed = (np.array([row[i] for row in path]) for i in (0, 1))
+    q, speed = np.array(path).transpose(1, 0, 2)
     np.testing.assert_allclose(np.diff(q, axis=0) / DT, speed[1:], atol=1e-4)
     assert np.abs(speed - v).max() > 1e-3
 
@@ -138,43 +131,25 @@ def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None
     assert 0.5e-3 < np.linalg.norm(moved) < 10e-3
 
 
-def test_both_plants_have_the_same_true_arm() -> None:
-    drawn = draw_errors(Errors(level="poor"), 7).arm
-    q = lbr.HOME + np.linspace(-0.3, 0.3, 7)
-    dart, mujoco = (plant(Robot(), q, drawn) for plant in PLANTS)
-    np.testing.assert_allclose(mujoco.tool_motion(), dart.tool_motion(), atol=1e-9)
-    np.testing.assert_allclose(mujoco.link_poses()[:, :3], dart.link_poses()[:, :3], atol=1e-9)
-    np.testing.assert_allclose(mujoco.gravity_torque(), dart.gravity_torque(), atol=1e-6)
-    X, _ = dart.link_pose("indenter")  # DART's own chain, not our table
-    np.testing.assert_allclose(X, dart.tool_motion()[:3], atol=1e-9)
-
-
 @pytest.mark.parametrize("plant", PLANTS)
 def test_the_sensor_feels_the_true_tool_and_the_controller_carries_the_nominal_one(plant: Any) -> None:
-    drawn = arm(tool_mass=0.3, seed=3)
+    drawn, weights, carried = arm(tool_mass=0.3, seed=3), [], []
     assert abs(drawn.tool_mass - 1) > 0.05
-    true, nominal = plant(Robot(), drawn=drawn), plant(Robot())
-    for one in (true, nominal):
-        held(one)
-    weight = Robot().tool_mass_kg * GRAVITY
-    assert true.sensor_wrench()[2] == pytest.approx(drawn.tool_mass * weight, abs=2e-2)
-    assert nominal.sensor_wrench()[2] == pytest.approx(weight, abs=2e-2)
-    np.testing.assert_allclose(true.gravity_torque(), nominal.gravity_torque(), atol=1e-3)
-
-
-def held(plant: Plant) -> None:
-    for _ in range(3):
-        plant.step(plant.gravity_torque(), NOTHING, NOTHING, np.full(7, 1e6))
+    for one in (plant(Robot(), drawn=drawn), plant(Robot())):
+        for _ in range(3):
+            one.step(one.gravity_torque(), NOTHING, NOTHING, np.full(7, 1e6))
+        weights.append(one.sensor_wrench()[2] / (Robot().tool_mass_kg * GRAVITY))
+        carried.append(one.gravity_torque())
+    assert weights == pytest.approx([drawn.tool_mass, 1.0], abs=6e-3)
+    np.testing.assert_allclose(*carried, atol=1e-3)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
 def test_friction_is_that_of_the_true_arm(plant: Any) -> None:
     """A steady turn of A1 under a torque: speed = (torque - Coulomb) / viscous."""
     drawn = arm(friction=0.4, damping=0.4, seed=2)
-    robot = Robot(joint_friction_nm=2.0, joint_damping_nms=20.0)
-    one = plant(robot, drawn=drawn)
-    torque = np.array([6.0, 0, 0, 0, 0, 0, 0])
-    lock = np.array([0.0, *[1e6] * 6])
+    one = plant(Robot(joint_friction_nm=2.0, joint_damping_nms=20.0), drawn=drawn)
+    torque, lock = 6.0 * np.eye(7)[0], np.array([0.0, *[1e6] * 6])
     for _ in range(1500):
         one.step(one.gravity_torque() + torque, NOTHING, NOTHING, lock)
     expected = (6.0 - 2.0 * drawn.friction[0]) / (20.0 * drawn.damping[0])
@@ -190,9 +165,8 @@ def test_the_service_measures_another_tool_pose_than_the_true_one_and_reports_th
         service = create(scenario)
         assert service.start()["robot_description"].data == urdf(scenario.robot)
         sent = service.step(0, HandInbox())
-        p = sent["sim/tool_state"].pose.position
         reported = tool_pose(sent["joint_states"].position, scenario.robot)[:3, 3]
-        found.append(np.linalg.norm(reported - (p.x, p.y, p.z)))
+        found.append(np.linalg.norm(reported - vector(sent["sim/tool_state"].pose.position)))
     assert found[0] < 1e-5
     drawn = draw_errors(Errors(level="poor"), 5).arm
     lengths = DartPlant(Robot(), drawn=drawn).tool_motion()[:3] - DartPlant(Robot()).tool_motion()[:3]
@@ -208,11 +182,9 @@ def test_the_emulated_arm_has_the_errors_and_the_driver_does_not_know_them() -> 
     emulator = Emulator(plant_input(scenario))
     state, tool = emulator.state(0), emulator.tool(0)
     reported = tool_pose(np.array(state.measured_joint_position), scenario.robot)[:3, 3]
-    p = tool.pose.position
-    assert np.linalg.norm(reported - (p.x, p.y, p.z)) > 1e-3
+    assert np.linalg.norm(reported - vector(tool.pose.position)) > 1e-3
     off = np.array(state.measured_joint_position) - lbr.HOME
     np.testing.assert_allclose(off, drawn.arm.zero_rad, atol=1e-4 * 60 + 3e-4)
-    f = emulator.wrench(0).wrench.force
     expected = drawn.force.bias[2] + drawn.arm.tool_mass * scenario.robot.tool_mass_kg * GRAVITY
-    assert f.z == pytest.approx(expected, abs=1.5)
+    assert emulator.wrench(0).wrench.force.z == pytest.approx(expected, abs=1.5)
     assert Rig().driver.start()["robot_description"].data == urdf(scenario.robot)
