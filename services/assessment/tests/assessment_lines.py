@@ -6,11 +6,15 @@ import numpy as np
 
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.grid import MapGrid, map_grid
+from palpate_assessment.model import Regression, prior_log_amplitudes
+from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import USUAL
 
 REGION = 0.14
 SPACING, ALONG, SPEED = 0.0125, 0.005, 0.03
-LEVEL = float(np.log(2.5))
+LEVEL, UP = float(np.log(2.5)), np.array((0.0, 0.0, 1.0))
 Field = Callable[[np.ndarray], np.ndarray]
 
 
@@ -63,20 +67,21 @@ def lines(
             felt = np.array((x + (calibration.lead_s * forth * SPEED if k else 0.0), y))
             log_force = field(felt[None])[0] + calibration.exponent * np.log1p(wrong / 0.01)
             log_force += calibration.conversion + conversion if k else calibration.held
-            samples.append(
-                ForceSample(
-                    time=time,
-                    position=np.array((x, y, 0.0)),
-                    normal=np.array((0.0, 0.0, 1.0)),
-                    velocity=np.array((forth * SPEED if k else 0.0, 0.0, 0.0)),
-                    depth=0.010,
-                    force=float(np.exp(log_force + noise * rng.standard_normal())),
-                    force_noise=0.01,
-                    time_in_contact=k * ALONG / SPEED,
-                    force_limited=False,
-                    stroke=stroke,
-                    depth_uncertainty=float(np.hypot(stroke_m, breathing_m)),
-                    exponent=0.0 if k else float(calibration.exponent if exponent is None else exponent(felt[None])[0]),
-                )
-            )
+            force = float(np.exp(log_force + noise * rng.standard_normal()))
+            velocity, unsure = np.array((forth * SPEED if k else 0.0, 0.0, 0.0)), float(np.hypot(stroke_m, breathing_m))
+            steep = 0.0 if k else float(calibration.exponent if exponent is None else exponent(felt[None])[0])
+            held = (0.010, force, 0.01, k * ALONG / SPEED, False, stroke, unsure, steep)
+            samples.append(ForceSample(time, np.array((x, y, 0.0)), UP, velocity, *held))
     return samples
+
+
+def observations(samples: list[ForceSample]) -> Observations:
+    o = observe(samples, USUAL)
+    assert o is not None
+    return o
+
+
+def regression(samples: list[ForceSample], *lumps: Bump) -> Regression:
+    """Return the regression with the amplitudes of the prior."""
+    o = observations(samples)
+    return Regression(o, lumps, prior_log_amplitudes(o))

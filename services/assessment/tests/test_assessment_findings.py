@@ -4,17 +4,15 @@ from functools import partial
 
 import numpy as np
 import pytest
-from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
+from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural, observations
 
 from palpate_assessment.assess import AssessedMap, assess, assess_growing
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import Candidate, Signs, signs
 from palpate_assessment.findings import causes, marked_share
 from palpate_assessment.model import Regression, fit_log_amplitudes
-from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump
-from palpate_assessment.standard import USUAL
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.codes import FindingKind
 from palpate_models.scenario.schema import Marked
@@ -22,8 +20,8 @@ from palpate_models.scenario.schema import Marked
 REACH, FALSE_FINDINGS = 0.010, 0.02
 
 
-def examine(samples: list[ForceSample]) -> AssessedMap:
-    result = assess(samples, flat_grid(), REACH, FALSE_FINDINGS)
+def examine(samples: list[ForceSample], rate: float = FALSE_FINDINGS, marked: tuple[Marked, ...] = ()) -> AssessedMap:
+    result = assess(samples, flat_grid(), REACH, rate, marked=marked)
     assert result is not None
     return result
 
@@ -31,6 +29,11 @@ def examine(samples: list[ForceSample]) -> AssessedMap:
 def held(result: AssessedMap, truth: np.ndarray) -> float:
     inside = result.unassessed == StiffnessMap.ASSESSED
     return float(((result.lower <= truth) & (truth <= result.upper))[inside].mean())
+
+
+def width(result: AssessedMap) -> np.ndarray:
+    """Return the log of upper over lower where the map was assessed."""
+    return np.log(result.upper / result.lower)[result.unassessed == StiffnessMap.ASSESSED]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -61,11 +64,8 @@ def test_two_lumps_are_two_findings() -> None:
 
 
 def test_errors_of_strokes_widen_the_band() -> None:
-    def width(result: AssessedMap) -> float:
-        return float(np.median(np.log(result.upper / result.lower)[result.unassessed == StiffnessMap.ASSESSED]))
-
     exact, wrong = (examine(lines(level, stroke_m=error)) for error in (0.0, 0.001))
-    assert width(wrong) > 1.2 * width(exact)
+    assert np.median(width(wrong)) > 1.2 * np.median(width(exact))
 
 
 def test_a_lower_rate_of_false_findings_reports_less() -> None:
@@ -73,13 +73,9 @@ def test_a_lower_rate_of_false_findings_reports_less() -> None:
     for contrast in (1.2, 1.35, 1.5):
         bump = partial(lump, centre=(0.0, 0.0), radius=0.02, contrast=contrast)
         samples = lines(lambda xy, bump=bump: LEVEL + wall(xy) + bump(xy), stroke_m=0.0007, breathing_m=0.0007)
-        weighed = []
-        for rate in found:
-            result = assess(samples, flat_grid(), REACH, rate)
-            assert result is not None
-            found[rate] += len(result.findings)
-            weighed.append(len(result.findings) + len(result.candidates))
-        assert weighed[0] == weighed[1]
+        results = {rate: examine(samples, rate) for rate in found}
+        assert len({len(result.findings + result.candidates) for result in results.values()}) == 1
+        found = {rate: count + len(results[rate].findings) for rate, count in found.items()}
     assert found[1e-4] < found[0.5]
 
 
@@ -97,18 +93,18 @@ def test_a_stroke_piece_that_the_others_contradict_is_not_assessed() -> None:
 
 
 def test_a_place_where_the_force_limit_was_met_far_above_the_depth_is_not_assessed() -> None:
-    samples = [s._replace(force=15.0, depth=0.004, force_limited=True) if s.position[0] > 0.05 else s for s in lines(level)]
-    result = examine(samples)
+    limited = {"force": 15.0, "depth": 0.004, "force_limited": True}
+    result = examine([s._replace(**limited) if s.position[0] > 0.05 else s for s in lines(level)])  # type: ignore[arg-type]
     x, y = result.grid.nodes[:, :2].T
     assert (result.unassessed[(x > 0.057) & (x < 0.07) & (np.abs(y) < 0.06)] == StiffnessMap.YIELDED).all()
     assert result.findings == []
 
 
 def test_a_lump_whose_middle_yields_to_the_force_limit_is_one_finding() -> None:
-    limit, calibration = 8.0, load_calibration()
+    limit, exponent = 8.0, load_calibration().exponent
 
     def yielding(sample: ForceSample) -> ForceSample:
-        depth = sample.depth * min(1.0, (limit / sample.force) ** (1 / calibration.exponent))
+        depth = sample.depth * min(1.0, (limit / sample.force) ** (1 / exponent))
         return sample._replace(force=min(sample.force, limit), depth=depth, force_limited=sample.force > limit)
 
     samples = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.025, 4.0))
@@ -119,13 +115,11 @@ def test_a_lump_whose_middle_yields_to_the_force_limit_is_one_finding() -> None:
 
 
 def test_the_map_says_what_was_not_reached() -> None:
-    samples = [s for s in lines(level) if s.position[0] < 0]
-    result = examine(samples)
+    result = examine([s for s in lines(level) if s.position[0] < 0])
     x, y = result.grid.nodes[:, :2].T
     assert (result.unassessed[x > 0.012] == StiffnessMap.NOT_REACHED).all()
     assert (result.unassessed[(np.abs(y) < 0.05) & (x < -0.005) & (x > -0.05)] == StiffnessMap.ASSESSED).all()
-    widths = np.log(result.upper / result.lower)
-    assert np.median(widths[x > 0.05]) > 1.3 * np.median(widths[result.unassessed == StiffnessMap.ASSESSED])
+    assert np.median(np.log(result.upper / result.lower)[x > 0.05]) > 1.3 * np.median(width(result))
 
 
 def test_too_few_samples_are_no_map() -> None:
@@ -149,10 +143,8 @@ WALL = natural(3, 0.08)
 
 
 def seen(samples: list[ForceSample]) -> Signs:
-    o = observe(samples, USUAL)
-    assert o is not None
-    lumps = (Bump(*MIDDLE, 0.03),)
-    return signs(Regression(o, lumps, fit_log_amplitudes(o, lumps)), lumps[0])
+    o, shape = observations(samples), Bump(*MIDDLE, 0.03)
+    return signs(Regression(o, (shape,), fit_log_amplitudes(o, (shape,))), shape)
 
 
 def letting_go(samples: list[ForceSample]) -> list[ForceSample]:
@@ -189,17 +181,13 @@ def test_lump_muscle_and_neither_compete() -> None:
     assert (kinds_if_rare[:, FindingKind.LUMP] < kinds[:, FindingKind.LUMP]).all()
 
 
-@pytest.mark.parametrize("conversion", [-0.2, 0.2])
-def test_held_presses_determine_the_conversion_of_slides(conversion: float) -> None:
-    result = examine(lines(lambda xy: LEVEL + WALL(xy), conversion=conversion))
-    assert result.background == pytest.approx(np.exp(LEVEL), rel=0.1)
-    assert held(result, np.exp(LEVEL + WALL(result.grid.nodes[:, :2]))) > 0.85
-
-
-def test_without_held_presses_the_band_is_wide() -> None:
-    samples = lines(level, conversion=0.15)
-    result = examine([s for s in samples if np.any(s.velocity)])
-    assert held(result, np.full(len(result.apparent), np.exp(LEVEL))) > 0.95
+@pytest.mark.parametrize(("conversion", "presses"), [(-0.2, True), (0.2, True), (0.15, False)])
+def test_held_presses_determine_the_conversion_of_slides_or_the_band_is_wide(conversion: float, presses: bool) -> None:
+    samples = lines(lambda xy: LEVEL + WALL(xy), conversion=conversion)
+    result = examine([s for s in samples if presses or np.any(s.velocity)])
+    assert held(result, np.exp(LEVEL + WALL(result.grid.nodes[:, :2]))) > (0.85 if presses else 0.95)
+    if presses:
+        assert result.background == pytest.approx(np.exp(LEVEL), rel=0.1)
 
 
 def ridge_field(xy: np.ndarray) -> np.ndarray:
@@ -209,13 +197,10 @@ def ridge_field(xy: np.ndarray) -> np.ndarray:
 
 def test_a_ridge_is_named_and_marked_skin_is_believed() -> None:
     samples, scar = lines(ridge_field), Marked(path_m=((-0.032, -0.024), (0.032, 0.024)), width_m=0.02)
-    ridges = []
-    for marked in ((), (scar,)):
-        result = assess(samples, flat_grid(), REACH, FALSE_FINDINGS, marked=marked)
-        assert result is not None
-        ridges.append(max(result.findings + result.candidates, key=lambda area: area.strength))
-    assert ridges[0].kind is FindingKind.RIDGE
-    assert ridges[1].ridge > ridges[0].ridge
+    results = (examine(samples, marked=marked) for marked in ((), (scar,)))
+    plain, marked = (max(r.findings + r.candidates, key=lambda area: area.strength) for r in results)
+    assert plain.kind is FindingKind.RIDGE
+    assert marked.ridge > plain.ridge
 
 
 def test_a_short_scar_is_not_lost_in_a_wider_shape_and_a_long_one_counts_where_it_is() -> None:
@@ -232,7 +217,6 @@ def test_bone_is_stiff_beyond_the_border_and_steeper() -> None:
     def bone(xy: np.ndarray) -> np.ndarray:
         return 1 / (1 + np.exp((0.05 - xy[:, 0]) / 0.008))
 
-    samples = lines(lambda xy: LEVEL + 1.2 * bone(xy), exponent=lambda xy: 1.4 + 1.2 * bone(xy))
-    result = examine(samples)
+    result = examine(lines(lambda xy: LEVEL + 1.2 * bone(xy), exponent=lambda xy: 1.4 + 1.2 * bone(xy)))
     assert not result.findings
     assert max(result.candidates, key=lambda area: area.strength).kind is FindingKind.BONE

@@ -1,5 +1,7 @@
 """Samples from states: averages, the map's grid, depth from the final skin and from measured breathing."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -23,19 +25,12 @@ def run(states: list[ContactState]) -> list[ForceSample]:
     return [s for s in map(sampler.add, states) if s is not None]
 
 
-def test_one_sample_every_few_millimetres() -> None:
-    samples = run([state(k, x=0.0003 * k) for k in range(400)])
+def test_one_sample_every_few_millimetres_from_what_counts() -> None:
+    samples = run([state(k, x=0.0003 * k, force=2.0 if k < 400 else 50.0, counts=k < 400) for k in range(600)])
     assert len(samples) == pytest.approx(0.12 / TRAVEL, abs=2)
-    x = np.array([s.position[0] for s in samples])
-    assert np.diff(x) == pytest.approx(TRAVEL, rel=0.15)
+    assert np.diff([s.position[0] for s in samples])[:-1] == pytest.approx(TRAVEL, rel=0.15)
     assert [s.velocity[0] for s in samples] == pytest.approx([0.03] * len(samples))
-
-
-def test_what_does_not_count_is_in_no_sample() -> None:
-    states = [state(k, x=0.0003 * k, force=2.0 if k < 100 else 50.0, counts=k < 100) for k in range(200)]
-    samples = run(states)
-    assert samples
-    assert max(s.force for s in samples) == pytest.approx(2.0)
+    assert [s.force for s in samples] == pytest.approx([2.0] * len(samples))
 
 
 def test_a_stroke_that_ends_hands_over_what_it_has() -> None:
@@ -62,22 +57,18 @@ def test_a_press_held_before_a_slide_is_a_sample() -> None:
 
 
 def test_time_in_contact_restarts_with_each_stroke() -> None:
-    first = [state(k, x=0.0003 * k) for k in range(100)]
     gap = [state(100, depth=-0.01, counts=False, touching=False)]
-    second = [state(101 + k, x=0.05 + 0.0003 * k) for k in range(100)]
+    first, second = ([state(start + k, x=x + 0.0003 * k) for k in range(100)] for start, x in ((0, 0.0), (101, 0.05)))
     samples = run(first + gap + second)
-    onset = [s.time_in_contact for s in samples if s.position[0] > 0.04]
-    assert onset[0] < 0.2
+    assert next(s.time_in_contact for s in samples if s.position[0] > 0.04) < 0.2
     assert max(s.time_in_contact for s in samples) < 1.0
 
 
 def test_averages_force_depth_and_their_noise() -> None:
-    rng = np.random.Generator(np.random.PCG64(0))
-    noise = rng.normal(0, 0.1, 4000)
+    noise = np.random.Generator(np.random.PCG64(0)).normal(0, 0.1, 4000)
     samples = run([state(k, x=0.0003 * k, force=2.0 + float(noise[k])) for k in range(4000)])
     assert np.mean([s.force for s in samples]) == pytest.approx(2.0, abs=0.01)
-    per_sample = 0.1 / np.sqrt(TRAVEL / 0.0003)
-    assert np.median([s.force_noise for s in samples]) == pytest.approx(per_sample, rel=0.25)
+    assert np.median([s.force_noise for s in samples]) == pytest.approx(0.1 / np.sqrt(TRAVEL / 0.0003), rel=0.25)
 
 
 def test_the_grid_follows_the_surface() -> None:
@@ -104,6 +95,12 @@ SHARES = np.array((1.0, 0.8, 0.5))
 DEPTH = 0.010
 
 
+def perceived() -> SeenBreath:
+    breath = SeenBreath()
+    breath.perceive(VERTICES, SHARES)
+    return breath
+
+
 def true_breath(t: float) -> float:
     return 0.004 * np.sin(1.5 * t)
 
@@ -127,8 +124,7 @@ def followed_for(breath: SeenBreath, seconds: float, delay: float = 0.15) -> lis
 
 
 def test_depth_is_corrected_by_the_measured_breathing() -> None:
-    breath = SeenBreath()
-    breath.perceive(VERTICES, SHARES)
+    breath = perceived()
     settled = followed_for(breath, 5.0)
     seen = [one for _, one in settled if one.time > 0.2]
     assert [one.time for _, one in settled] == sorted(one.time for _, one in settled)
@@ -138,16 +134,14 @@ def test_depth_is_corrected_by_the_measured_breathing() -> None:
 
 
 def test_without_images_nothing_waits_and_nothing_changes() -> None:
-    breath = SeenBreath()
-    breath.perceive(VERTICES, SHARES)
+    breath = perceived()
     for t in (0.00, 0.01, 0.02):
         breath.take(missed(t))
         assert [one.time for one in breath.take_settled()] == [t]
 
 
 def test_a_camera_that_falls_silent_holds_nothing_back_for_longer_than_half_a_second() -> None:
-    breath = SeenBreath()
-    breath.perceive(VERTICES, SHARES)
+    breath = perceived()
     followed_for(breath, 1.0)
     late = []
     for k in range(100, 300):
@@ -177,6 +171,10 @@ def wall() -> Message:
     return SurfaceMesh(header(10 * NS, "world"), p_W.astype(np.float32).ravel(), normals.ravel(), np.empty(0), np.empty(0))
 
 
+def skin(height: float = 0.002, count: int = 9) -> Any:
+    return skin_of(wall(), correction(count, height), X_AW)
+
+
 def correction(count: int, height: float = 0.002) -> Message:
     outward, sigma = np.full(count, height, np.float32), np.full(count, 1e-4, np.float32)
     return SurfaceCorrection(header(20 * NS, "abdomen"), outward, sigma)
@@ -189,26 +187,20 @@ def felt(time: float, reported: float, x: float = 0.02) -> ForceSample:
 
 
 def test_depth_counts_from_where_the_skin_was_after_all() -> None:
-    skin = skin_of(wall(), correction(9), X_AW)
-    assert skin is not None
-    again = skin.again([felt(12.0, 0.0015), felt(13.0, 0.0025)])
+    again = skin().again([felt(12.0, 0.0015), felt(13.0, 0.0025)])
     assert [s.depth for s in again] == pytest.approx((0.0105, 0.0095), abs=1e-7)
     assert [s.depth_uncertainty for s in again] == pytest.approx((1e-4, 1e-4))
 
 
 def test_samples_before_the_scan_or_off_the_surface_are_unchanged() -> None:
-    skin = skin_of(wall(), correction(9), X_AW)
-    assert skin is not None
     before, other = felt(9.0, 0.0), felt(12.0, 0.0)._replace(position=np.array((0.3, 0.0, 0.2)))
-    assert skin.again([before, other]) == [before, other]
+    assert skin().again([before, other]) == [before, other]
 
 
 def test_a_correction_of_another_surface_is_none() -> None:
-    assert skin_of(wall(), correction(8), X_AW) is None
+    assert skin(count=8) is None
 
 
 def test_a_correction_that_the_strokes_contradict_is_far_from_them() -> None:
-    skin = skin_of(wall(), correction(9, 0.03), X_AW)
-    assert skin is not None
-    assert skin.middle_change([felt(12.0, 0.0015)]) == pytest.approx(0.0285, abs=1e-6)
-    assert skin.middle_change([]) == 0.0
+    assert skin(0.03).middle_change([felt(12.0, 0.0015)]) == pytest.approx(0.0285, abs=1e-6)
+    assert skin(0.03).middle_change([]) == 0.0

@@ -4,8 +4,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_models.robot.arm import urdf
-from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT
+from palpate_models.robot.arm import tool_pose, urdf
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
@@ -29,7 +29,7 @@ def scan() -> tuple[np.ndarray, np.ndarray, PostureSequence]:
     return positions, normals, plan_redundancy(ROBOT, positions, normals, np.array(HOME))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_functions_agree_with_the_urdf(seed: int) -> None:
     """Pose, Jacobian's rank measure and torque against pinocchio, for a base anywhere."""
     rng = np.random.default_rng(seed)
@@ -60,24 +60,17 @@ def test_planning_uses_what_was_prepared(scan: tuple[np.ndarray, np.ndarray, Pos
     assert placement._program.cache_info().misses == made
 
 
-def test_every_target_is_met_within_limits(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+def test_every_target_is_met_smoothly_within_limits(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
+    """No change of branch: over the 20 mm between targets a joint turns by less than 0.5 rad (the elbow, nearly straight)."""
     positions, normals, postures = scan
     assert postures.reachable.all() and postures.refined
-    model = pin.buildModelFromXML(urdf(ROBOT))
-    data = model.createData()
-    for q, p, n in zip(postures.q, positions, normals, strict=True):
-        pin.framesForwardKinematics(model, data, q)
-        pose = data.oMf[model.getFrameId("indenter")]
-        np.testing.assert_allclose(pose.translation, p, atol=1e-5)
-        np.testing.assert_allclose(pose.rotation[:, 2], -n, atol=1e-5)
+    poses = np.array([tool_pose(q, ROBOT) for q in postures.q])
+    np.testing.assert_allclose(poses[:, :3, 3], positions, atol=1e-5)
+    np.testing.assert_allclose(poses[:, :3, 2], -normals, atol=1e-5)
     np.testing.assert_allclose(postures.margin, (POSITION_LIMIT - np.abs(postures.q)).min(axis=1))
     assert postures.margin.min() > np.deg2rad(5)
     assert postures.torque_fraction.max() < 0.5
-
-
-def test_postures_follow_the_path_smoothly(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
-    """No change of branch: over the 20 mm between targets a joint turns by less than 0.5 rad (the elbow, nearly straight)."""
-    assert np.abs(np.diff(scan[2].q, axis=0)).max() < 0.5
+    assert np.abs(np.diff(postures.q, axis=0)).max() < 0.5
 
 
 def test_what_is_out_of_reach_is_flagged_and_the_rest_is_served() -> None:
@@ -88,25 +81,16 @@ def test_what_is_out_of_reach_is_flagged_and_the_rest_is_served() -> None:
     assert np.flatnonzero(~postures.reachable).tolist() == [7, 20]
     assert postures.q.shape == (len(positions), 7)
     assert (np.abs(postures.q) <= POSITION_LIMIT).all()
+    nowhere = plan_redundancy(ROBOT, positions[:2] + 5.0, normals[:2], np.array(HOME))
+    assert not nowhere.reachable.any() and not nowhere.refined
 
 
-def test_nothing_in_reach_is_no_error() -> None:
-    positions, normals = dome(0.1)
-    postures = plan_redundancy(ROBOT, positions + 5.0, normals, np.array(HOME))
-    assert not postures.reachable.any() and not postures.refined
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_few_targets(count: int) -> None:
-    positions, normals = dome(0.05)
-    postures = plan_redundancy(ROBOT, positions[:count], normals[:count], np.array(HOME))
+@pytest.mark.parametrize("count", [1, 2, 25])
+def test_few_targets_and_a_wider_margin(count: int) -> None:
+    positions, normals = (values[:count] for values in dome(0.05))
+    postures = plan_redundancy(ROBOT, positions, normals, np.array(HOME), joint_margin_rad=0.15)
     assert postures.q.shape == (count, 7)
     assert postures.reachable.shape == (count,) and postures.reachable.all()
-
-
-def test_joint_margin_is_kept() -> None:
-    positions, normals = dome(0.05)
-    postures = plan_redundancy(ROBOT, positions, normals, np.array(HOME), joint_margin_rad=0.15)
     assert postures.margin.min() >= 0.15 - 1e-9
 
 
@@ -121,7 +105,6 @@ def test_default_base_serves_the_default_scan() -> None:
         assert postures.reachable.all()
         assert np.rad2deg(postures.margin.min()) > 8
         assert postures.torque_fraction.max() < 0.4
-        assert (np.abs(postures.torque_fraction * TORQUE_LIMIT.max()) < TORQUE_LIMIT.max()).all()
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from planning_fakes import hertz
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import GRAVITY
@@ -45,29 +46,32 @@ def test_acceleration_of_the_tool_is_no_contact() -> None:
     assert np.linalg.norm(tool.contact_force_W(R, seen, np.zeros(3))) > 0.2
 
 
-def test_taring_averages_noise_out() -> None:
+def test_taring_averages_noise_out_and_a_second_one_replaces_the_first() -> None:
     rng = np.random.default_rng(1)
     tool, com = ForceCompensation(0.35), np.array((0.0, 0.0, 0.07))
     R = np.diag((-1.0, 1.0, -1.0))
-    for _ in range(300):
-        tool.update(R, reading(R, np.zeros(3), np.full(6, 0.5), 0.35, com) + rng.normal(0, 0.05, 6), taring=True)
-    assert tool.bias == pytest.approx(np.full(3, 0.5), abs=0.012)
-
-
-def test_a_second_taring_replaces_the_bias() -> None:
-    tool = ForceCompensation(0.35)
-    for value in (1.0, 2.0):
-        tool.update(np.eye(3), np.zeros(6), taring=False)
-        tool.update(np.eye(3), reading(np.eye(3), np.zeros(3), np.full(6, value), 0.35, np.zeros(3)), taring=True)
-    assert tool.bias == pytest.approx(np.full(3, 2.0))
+    for bias in (2.0, 0.5):
+        tool.update(R, np.zeros(6), taring=False)
+        for _ in range(300):
+            tool.update(R, reading(R, np.zeros(3), np.full(6, bias), 0.35, com) + rng.normal(0, 0.05, 6), taring=True)
+        assert tool.bias == pytest.approx(np.full(3, bias), abs=0.012)
 
 
 LIMIT_N = 15.0
 DASHPOT_S = 0.05
 
 
-def hertz(newton: float) -> Callable[[float], float]:
-    return lambda depth: newton * (max(depth, 0.0) / 0.01) ** 1.45
+def regulator(start_m: float, stiffness: float = NORMAL_STIFFNESS) -> DepthRegulator:
+    begun = DepthRegulator(0.01, stiffness, LIMIT_N, 0.02)
+    begun.reset(start_m)
+    return begun
+
+
+def update(
+    one: DepthRegulator, depth_m: float, force_n: float, target_m: float = 0.01, load_n: float | None = None
+) -> Regulation:
+    load, touching = abs(force_n) if load_n is None else load_n, force_n > 0.15
+    return one.update(target_m=target_m, depth_m=depth_m, normal_force_n=force_n, load_n=load, in_contact=touching)
 
 
 def indent(force: Callable[[float, float], float], follow_s: float | None = None) -> np.ndarray:
@@ -77,10 +81,8 @@ def indent(force: Callable[[float, float], float], follow_s: float | None = None
     `follow_s` and yields by admittance. `force` by depth and time; sensor noise; the command comes into force 10 ms late and is
     extrapolated by its rate.
     """
-    rng, yielded = np.random.default_rng(0), 0.0
+    rng, yielded, one = np.random.default_rng(0), 0.0, regulator(-0.01)
     mass, damping, dt = 4.0, 2 * 0.8 * np.sqrt(NORMAL_STIFFNESS * 4.0), 1e-3
-    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
-    regulator.reset(-0.01)
     x, v, target = -0.01, 0.0, -0.01
     latest: tuple[Regulation, float] | None = None
     pending: tuple[Regulation, float] | None = None
@@ -92,24 +94,15 @@ def indent(force: Callable[[float, float], float], follow_s: float | None = None
         forces.append(F)
         if k % 10 == 0 and k:
             latest = pending
-            depth, measured = float(np.mean(depths[-10:])), float(np.mean(forces[-10:])) + rng.normal(0, 0.016)
-            room = 1.0 if latest is None else np.clip((1 - latest[0].expected_force / regulator.force_max) / 0.3, 0.01, 1)
+            depth, pressed = float(np.mean(depths[-10:])), float(np.mean(forces[-10:]))
+            room = 1.0 if latest is None else np.clip((1 - latest[0].expected_force / one.force_max) / 0.3, 0.01, 1)
             target = min(target + 0.0002 * room, 0.010)
-            pending = (
-                regulator.update(
-                    target_m=target, depth_m=depth, normal_force_n=measured, load_n=abs(measured), in_contact=measured > 0.15
-                ),
-                t,
-            )
-            rows.append((t, pending[0].reference_m, depth, float(np.mean(forces[-10:])), pending[0].limited))
+            pending = update(one, depth, pressed + rng.normal(0, 0.016), target), t
+            rows.append((t, pending[0].reference_m, depth, pressed, pending[0].limited))
         goal, rate, feed = -0.01, 0.0, 0.0
         if latest is not None:
-            regulation, since = latest
-            goal, rate, feed = (
-                regulation.command_m + regulation.rate * min(t - since, 0.03),
-                regulation.rate,
-                regulation.feed_forward_n,
-            )
+            rate, feed = latest[0].rate, latest[0].feed_forward_n
+            goal = latest[0].command_m + rate * min(t - latest[1], 0.03)
         if follow_s is None:
             pull = NORMAL_STIFFNESS * (goal - x) + damping * (rate - v) + feed - F - np.tanh(v / 0.002)
             v += pull / mass * dt
@@ -168,41 +161,29 @@ def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> No
 
 
 def test_lateral_force_reduces_depth_like_normal_force() -> None:
-    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
-    regulator.reset(0.01)
+    one = regulator(0.01)
     for _ in range(100):
-        regulation = regulator.update(target_m=0.01, depth_m=0.01, normal_force_n=11.0, load_n=16.0, in_contact=True)
+        regulation = update(one, 0.01, 11.0, load_n=16.0)
     assert regulation.limited
     assert regulation.reference_m < 0.0095
     assert regulation.feed_forward_n == pytest.approx(DEPTH.feed_forward * 11.0)
 
 
 def test_where_little_depth_gives_much_force_depth_does_not_return_to_its_target() -> None:
-    regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
-    regulator.reset(0.0032)
+    one = regulator(0.0032)
     for _ in range(100):
-        regulator.update(target_m=0.01, depth_m=0.0032, normal_force_n=11.0, load_n=11.0, in_contact=True)
-    references = [
-        regulator.update(target_m=0.01, depth_m=0.0028, normal_force_n=11.0, load_n=11.0, in_contact=True).reference_m
-        for _ in range(50)
-    ]
-    assert max(references) < 0.004
+        update(one, 0.0032, 11.0)
+    assert max(update(one, 0.0028, 11.0).reference_m for _ in range(50)) < 0.004
 
 
 def test_depth_is_never_commanded_beyond_its_limit() -> None:
-    regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
-    regulator.reset(0.0)
-    commands = [
-        regulator.update(target_m=0.019, depth_m=0.016, normal_force_n=1.0, load_n=1.0, in_contact=True).command_m
-        for _ in range(200)
-    ]
-    assert 0.0195 < max(commands) <= 0.02
+    one = regulator(0.0, 5000.0)
+    assert 0.0195 < max(update(one, 0.016, 1.0, 0.019).command_m for _ in range(200)) <= 0.02
 
 
 def test_in_free_air_nothing_winds_up() -> None:
-    regulator = DepthRegulator(0.01, 5000.0, LIMIT_N, 0.02)
-    regulator.reset(-0.02)
+    one = regulator(-0.02, 5000.0)
     for _ in range(500):
-        regulation = regulator.update(target_m=-0.02, depth_m=-0.018, normal_force_n=0.01, load_n=0.01, in_contact=False)
+        regulation = update(one, -0.018, 0.01, -0.02)
     assert regulation.command_m == pytest.approx(-0.02)
     assert regulation.feed_forward_n < 0.02

@@ -31,31 +31,15 @@ from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import WallEstimate, plane
 
 
-def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() -> None:
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_a_result_is_due_at_its_time_and_on_a_wall_clock_not_before_it_is_there(lockstep: bool) -> None:
     go = Event()
-    task = BackgroundTask(1000, 50, lambda: go.wait(10) and 7)
+    task = BackgroundTask(1000, 50, lambda: go.wait(10) and 7, lockstep=lockstep)
     assert not task.due(1049)
-    assert task.due(1050)
+    assert task.due(1050) is lockstep
     go.set()
     assert task.result() == 7
-
-
-def test_on_a_wall_clock_an_unfinished_task_is_not_due() -> None:
-    go = Event()
-    task = BackgroundTask(1000, 50, lambda: go.wait(10) and 7, lockstep=False)
-    assert not task.due(5000)
-    go.set()
-    assert task.result() == 7
-    assert not task.due(1049)
-    assert task.due(1050)
-
-
-def test_exceptions_of_the_worker_are_raised() -> None:
-    def fail() -> int:
-        raise KeyError("why")
-
-    with pytest.raises(KeyError, match="why"):
-        BackgroundTask(0, 0, fail).result()
+    assert [task.due(1049), task.due(1050)] == [False, True]
 
 
 KINEMATICS = ArmKinematics(BASE, Limits())
@@ -93,8 +77,7 @@ def palpated(times: list[int]) -> list[Setpoint]:
 def free_palpation() -> Palpation:
     """Return a palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
-    wall = plane(np.eye(4))
-    return Palpation((segment, segment), known(), PERIOD_S, wall)
+    return Palpation((segment, segment), known(), PERIOD_S, plane(np.eye(4)))
 
 
 def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:
@@ -112,15 +95,13 @@ def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -
 MOVERS = {"follower": followed, "free segment": palpated}
 
 
-def test_the_rate_is_one_on_time_and_comes_up_from_none_after_a_gap() -> None:
-    ramp = RestartRamp()
-    assert [ramp.step(t) for t in ticks(5, TIMING.braked_ns, 10)] == [1.0] * 10
-    ramp = RestartRamp()
-    rates = [ramp.step(t) for t in ticks(5, TIMING.braked_ns + 10 * MS, 50)]
-    rise = TIMING.restart_ns // (10 * MS)
-    assert rates[:5] == [1.0] * 5
-    assert rates[5 : 5 + rise] == pytest.approx(np.arange(rise) / rise)
-    assert rates[5 + rise :] == [1.0] * (45 - rise)
+@pytest.mark.parametrize("late", [False, True])
+def test_the_rate_is_one_on_time_and_comes_up_from_none_after_a_gap(late: bool) -> None:
+    ramp, rise = RestartRamp(), TIMING.restart_ns // (10 * MS)
+    rates = [ramp.step(t) for t in ticks(5, TIMING.braked_ns + late * 10 * MS, 50)]
+    expected = np.ones(50)
+    expected[5 : 5 + rise] = np.arange(rise) / rise if late else 1.0
+    assert rates == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("mover", MOVERS)
@@ -186,18 +167,13 @@ def test_a_free_motion_waits_for_an_arm_that_is_behind() -> None:
     motion.segment = SimpleNamespace(free=Turn())  # type: ignore[assignment]
     motion._sample, motion._q_offset, motion._following = 0.0, None, True
     motion.setpoint(0, SimpleNamespace(q=HOME, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
+    rad, m = STROKE_MOTION.behind_rad, STROKE_MOTION.behind_m
     arrived = []
-    limit_rad, limit_m = STROKE_MOTION.behind_rad, STROKE_MOTION.behind_m
-    for rad, metres in (
-        (0.3, 0.0),
-        (limit_rad + 0.01, 0.0),
-        (limit_rad - 0.01, limit_m + 1e-3),
-        (limit_rad - 0.01, limit_m - 1e-3),
-    ):
+    for behind, below in ((0.3, 0.0), (rad + 0.01, 0.0), (rad - 0.01, m + 1e-3), (rad - 0.01, m - 1e-3)):
         motion.follow_free_motion(1.0)
         X_WI = tool_pose(Turn.q[-1], Robot())
-        X_WI[2, 3] -= metres
-        motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - rad, X_WI=X_WI), 1.0)  # type: ignore[arg-type]
+        X_WI[2, 3] -= below
+        motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - behind, X_WI=X_WI), 1.0)  # type: ignore[arg-type]
         arrived.append(motion.follow_free_motion(1.0))
     assert arrived == [False, False, False, True]
 
@@ -227,7 +203,6 @@ def test_the_posture_of_a_setpoint_moves_no_faster_than_its_limit() -> None:
 
 def test_a_fork_waits_for_the_planning_thread() -> None:
     future = WORKER.submit(sleep, 0.1)
-    child = os.fork()
-    if not child:
+    if not (child := os.fork()):
         os._exit(not future.done())
     assert os.waitpid(child, 0)[1] == 0

@@ -1,10 +1,12 @@
-"""The driver's watchdog, in one process and in several."""
+"""The emulated LBR, its session and pace, and the driver's watchdog, in one process and in several."""
 
 import os
+import socket
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +23,10 @@ from palpate_conductor.collector import Collector
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input, restrict_to_view
 from palpate_models.scenario.schema import RobotDriver
+from palpate_robot.backends.emulated import Metronome
 from palpate_robot.backends.hardware import TAKE_OVER_NS
-from palpate_robot.backends.lbr.emulator import Emulator
-from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
+from palpate_robot.backends.lbr.emulator import SESSION, Emulator, FriSession, main
+from palpate_robot.backends.lbr.port import TORQUE_COMMAND, ConnectionQuality, LBRTorqueCommand, SessionState, ZenohPort
 from palpate_robot.backends.lbr.watchdog import lbr_watchdog
 from palpate_robot.backends.watchdog import TIMEOUT_NS, Watchdog
 
@@ -40,12 +43,10 @@ def commanding() -> Emulator:
 
 def dead_driver(watched: bool) -> Emulator:
     """Return the arm 0.6 s after a driver that pushed has died."""
-    emulator = commanding()
-    watchdog = lbr_watchdog()
-    for cycle in range(400):
-        t = 2 * MS * cycle
+    emulator, watchdog = commanding(), lbr_watchdog()
+    for t in range(0, 800 * MS, 2 * MS):
         watchdog.state(t, emulator.state(1 + t))
-        if cycle < 100:
+        if t < 200 * MS:
             emulator.session.take(emulator.measured, PUSH)
             watchdog.command(t, b"driver")
         answer = watchdog.decide(t)
@@ -71,19 +72,17 @@ def started() -> Watchdog:
     return watchdog
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_it_waits_for_the_time_out_and_no_longer(late: bool) -> None:
-    watchdog = started()
-    assert (watchdog.decide(TIMEOUT_NS + MS if late else TIMEOUT_NS) is not None) is late
+def test_it_waits_for_the_time_out_and_no_longer_and_keeps_out_before_anything_was_commanded() -> None:
+    assert [started().decide(TIMEOUT_NS + late) is not None for late in (0, MS)] == [False, True]
+    assert lbr_watchdog().decide(10 * TIMEOUT_NS) is None
 
 
 def test_the_old_driver_does_not_get_the_arm_back_a_new_one_does() -> None:
     watchdog = started()
     assert watchdog.decide(2 * TIMEOUT_NS) is not None
-    watchdog.command(2 * TIMEOUT_NS, b"first")
-    assert watchdog.decide(2 * TIMEOUT_NS) is not None
-    watchdog.command(2 * TIMEOUT_NS, b"second")
-    assert watchdog.decide(2 * TIMEOUT_NS) is None
+    for driver, watched in ((b"first", True), (b"second", False)):
+        watchdog.command(2 * TIMEOUT_NS, driver)
+        assert (watchdog.decide(2 * TIMEOUT_NS) is not None) is watched
 
 
 def test_a_driver_that_died_before_the_watchdog_began_leaves_no_push() -> None:
@@ -101,33 +100,18 @@ def test_an_old_speed_is_not_damped() -> None:
     assert not answer[1].any()
 
 
-def test_before_anything_was_commanded_it_keeps_out() -> None:
-    assert lbr_watchdog().decide(10 * TIMEOUT_NS) is None
-
-
 @pytest.fixture
 def rig() -> Rig:
     return active_rig()
 
 
-def release(rig: Rig) -> None:
-    rig.inbox.events["supervisor/state"] = [replace(blank("palpation_msgs/msg/SupervisorState", rig.t), releases=1)]
-    rig.tick(20)
-
-
-def test_a_driver_that_wakes_and_hears_the_watchdog_holds(rig: Rig) -> None:
+def test_a_driver_that_wakes_and_hears_the_watchdog_holds_and_a_release_lasts_only_without_it(rig: Rig) -> None:
     rig.port.commanded_by = [b"watchdog"] * 16
     rig.tick(20)
-    assert rig.status.mode == RobotStatus.MODE_SAFE_HOLD
-    assert rig.status.cause == RobotStatus.CAUSE_DEVICE
-
+    assert (rig.status.mode, rig.status.cause) == (RobotStatus.MODE_SAFE_HOLD, RobotStatus.CAUSE_DEVICE)
     assert np.abs(rig.port.torques[-1]).max() < 0.5, "damping alone"
-
-
-def test_a_release_lasts_only_without_another_commander(rig: Rig) -> None:
-    rig.port.commanded_by = [b"watchdog"]
+    rig.inbox.events["supervisor/state"] = [replace(blank("palpation_msgs/msg/SupervisorState", rig.t), releases=1)]
     rig.tick(20)
-    release(rig)
     assert rig.status.mode == RobotStatus.MODE_ACTIVE
     rig.port.commanded_by = [b"watchdog"]
     rig.tick(20)
@@ -229,3 +213,117 @@ def test_a_new_driver_takes_over_from_a_watchdog_that_still_commands() -> None:
         rig.tick(1)
     rig.tick(600)
     assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
+
+
+PERIOD, WALL = 2 * MS, 1_700_000_000_000_000_000
+
+
+def paced(busy: dict[int, int], cycles: int = 100, rate: float = 1.0) -> tuple[list[int], list[int]]:
+    """When cycles begin and their stamps [ns], with a machine that loses `busy[k]` [ns] before cycle k."""
+    metronome = Metronome(PERIOD, 0, WALL, rate)
+    now, began, stamps = 0, [], []
+    for k in range(cycles):
+        now += busy.get(k, 0)
+        now += metronome.wait(now)
+        began.append(now)
+        stamps.append(metronome.begin(now))
+    return began, stamps
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.25])
+def test_undisturbed_it_keeps_the_period_without_drift(rate: float) -> None:
+    began, stamps = paced(dict.fromkeys(range(100), 300000), rate=rate)
+    assert began == [PERIOD / rate * (k + 1) for k in range(100)]
+    assert stamps == [WALL + round(rate * t) for t in began]
+
+
+@pytest.mark.parametrize("late", [10 * MS, 90 * MS, 400 * MS])
+def test_a_machine_that_stood_still_is_not_made_up_for(late: int) -> None:
+    began, stamps = paced({30: late})
+    gaps = [b - a for a, b in pairwise(began)]
+    assert gaps[29] == late
+    assert set(gaps[:29] + gaps[30:]) == {PERIOD}, "no cycle follows on the heels of another"
+    assert {b - a for a, b in pairwise(stamps)} == {PERIOD}, "the arm's own clock stood still, too"
+
+
+def test_an_address_that_is_in_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert main(["clean", "--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]) == 2
+    assert "that address is in use" in capsys.readouterr().err
+
+
+ZERO, HOME = np.zeros(7), np.array(lbr.HOME)
+
+
+def active() -> FriSession:
+    session = FriSession(2, HOME)
+    while session.state is not SessionState.COMMANDING_ACTIVE:
+        session.cycle(HOME, ZERO)
+    return session
+
+
+def test_states_come_in_order() -> None:
+    session = FriSession(2, HOME)
+    seen = [session.state]
+    for _ in range(500):
+        session.cycle(HOME, ZERO)
+        if session.state is not seen[-1]:
+            seen.append(session.state)
+    assert seen == list(SessionState)
+
+
+@pytest.mark.parametrize("period", [0, 101])
+def test_a_period_that_fri_does_not_have_is_refused(period: int) -> None:
+    with pytest.raises(ValueError, match="whole milliseconds"):
+        FriSession(period, HOME)
+
+
+def test_commands_before_commanding_are_passed_over_and_later_ones_kept_for_ever() -> None:
+    session = FriSession(2, HOME)
+    session.take(HOME, np.ones(7))
+    assert not session.cycle(HOME, ZERO).torque.any()
+    session = active()
+    session.take(HOME, np.ones(7))
+    for _ in range(2000):
+        drive = session.cycle(HOME, ZERO)
+    assert np.array_equal(drive.torque, np.ones(7)), "the stack has no time-out: that is why there is a watchdog"
+
+
+@pytest.mark.parametrize(
+    ("break_it", "words"),
+    [
+        (lambda s: s.take(HOME + 60.0, ZERO), "command guard"),
+        (lambda s: s.take(HOME, np.full(7, 300.0)), "controller"),
+        (lambda s: [s.cycle(q, ZERO) for q in (HOME, HOME + 0.01)], "command guard"),
+    ],
+    ids=["far", "strong", "fast"],
+)
+def test_what_breaks_a_rule_ends_the_session_for_good(break_it: object, words: str) -> None:
+    session = active()
+    break_it(session)  # type: ignore[operator]
+    session.cycle(HOME, ZERO)
+    assert words in session.ended
+    for _ in range(500):
+        session.cycle(HOME, ZERO)
+    assert session.state is SessionState.IDLE
+
+
+def test_a_client_that_does_not_answer_loses_quality_then_the_session() -> None:
+    session = active()
+    seen = set()
+    for _ in range(SESSION.quality_window):
+        session.cycle(HOME, ZERO, answered=False)
+        seen.add(session.quality)
+        if session.ended:
+            break
+    assert "POOR" in session.ended
+    assert seen == set(ConnectionQuality)
+
+
+def test_the_position_follows_as_the_stacks_controller_makes_it() -> None:
+    session = active()
+    session.take(HOME + 0.1, ZERO)
+    assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.01)
+    assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.02)

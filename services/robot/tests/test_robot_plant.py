@@ -1,30 +1,31 @@
-"""The plant against pinocchio, which shares none of its code, and against what physics demands."""
+"""The plants: DART against pinocchio, which shares none of its code, MuJoCo against DART, and the loop that follows positions."""
+
+from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
+from palpate_bus.messages import NS
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import arm as robot_arm, lbr
 from palpate_models.robot.arm import TOOL, link_names, tool_jacobian, urdf
-from palpate_models.robot.lbr import ARM
+from palpate_models.robot.lbr import ARM, HOME
+from palpate_models.scenario.errors import DrawnArm, Errors, draw_errors
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import CLEARANCE, DartPlant
 from palpate_robot.backends.mujoco.plant import MujocoPlant
+from palpate_robot.driver import Command, Driver
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant
+from palpate_robot.position_loop import TUNING, PositionLoop
 
 LINKS = link_names(Robot())
 NOTHING, NO_DAMPING = np.zeros(3), np.zeros(7)
 FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
 
 OVER_TABLE = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0])
-
-
-def _postures(count: int, seed: int = 1) -> np.ndarray:
-    """Random postures well above the table."""
-    rng = np.random.default_rng(seed)
-    return lbr.HOME + rng.uniform(-0.3, 0.3, (count, 7))
 
 
 def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
@@ -60,7 +61,7 @@ def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
     model, data = _model(FREE)
     rng = np.random.default_rng(3)
     frame = model.getFrameId("indenter")
-    for q in _postures(10):
+    for q in postures(10):
         v, torque = rng.uniform(-1, 1, 7), rng.uniform(-20, 20, 7)
         force, moment = rng.uniform(-20, 20, 3), rng.uniform(-1, 1, 3)
         plant.reset(q, v)
@@ -78,7 +79,7 @@ def test_friction_is_implicit() -> None:
     model, data = _model(robot)
     rng = np.random.default_rng(4)
     for extra in (0.0, 40.0):
-        for q in _postures(5):
+        for q in postures(5):
             v, torque = rng.uniform(-1, 1, 7), rng.uniform(-20, 20, 7)
             v[3] = 0.0
             plant.reset(q, v)
@@ -215,3 +216,143 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
         np.testing.assert_array_equal(quick.sensor_wrench(), thorough.sensor_wrench())
     assert bool(touched) is touches
     assert free > 100, "the test shall see steps without a search"
+
+
+def postures(count: int, seed: int = 1) -> np.ndarray:
+    """Random postures well above the table."""
+    return lbr.HOME + np.random.default_rng(seed).uniform(-0.3, 0.3, (count, 7))
+
+
+@pytest.mark.parametrize("drawn", [None, draw_errors(Errors(level="poor"), 7).arm], ids=["nominal", "poor"])
+def test_poses_twist_and_gravity_are_the_same(drawn: DrawnArm | None) -> None:
+    robot, rng = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3), np.random.default_rng(2)
+    mujoco, dart = (plant(robot, drawn=drawn) for plant in (MujocoPlant, DartPlant))
+    for q in postures(10):
+        v = rng.uniform(-1, 1, 7)
+        mujoco.reset(q, v)
+        dart.reset(q, v)
+        poses, poses_dart = mujoco.link_poses(), dart.link_poses()
+        np.testing.assert_allclose(poses[:, :3], poses_dart[:, :3], atol=1e-9)
+        turns, turns_dart = (Rotation.from_quat(found[:, 3:]).as_matrix() for found in (poses, poses_dart))
+        np.testing.assert_allclose(turns, turns_dart, atol=1e-9)
+        np.testing.assert_array_equal(mujoco.tool_motion()[:7], poses[-1])
+        np.testing.assert_allclose(mujoco.tool_motion()[7:], dart.tool_motion()[7:], atol=1e-9)
+        np.testing.assert_allclose(mujoco.gravity_torque(), dart.gravity_torque(), atol=1e-6)
+        np.testing.assert_allclose(dart.link_pose("indenter")[0], poses[-1, :3], atol=1e-9)  # DART's own chain, not our table
+
+
+def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[MujocoPlant, DartPlant]]:
+    """Both arms under the same torques and the same force at the tool, as strong as in an examination."""
+    mujoco, dart = MujocoPlant(robot), DartPlant(robot)
+    mujoco.reset(q)
+    dart.reset(q)
+    strength = np.array([20.0, 20.0, 15.0, 15.0, 6.0, 4.0, 2.0])
+    for tick in range(ticks):
+        torque = strength * np.sin(tick / 30 + np.arange(7))
+        force = np.array([3.0, -2.0, 15.0]) * np.sin(tick / 50)
+        for plant in (mujoco, dart):
+            plant.step(plant.gravity_torque() + torque, force, np.array([0.1, 0.2, 0.05]), np.zeros(7))
+        yield mujoco, dart
+
+
+@pytest.mark.parametrize(("friction", "part"), [(0.0, 1.0), (Robot().joint_friction_nm, 0.95)])
+def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float, part: float) -> None:
+    """The difference is half a millisecond of motion. Where a joint turns round, friction jumps, one step earlier or later."""
+    positions, errors, readings = [], [], []
+    for mujoco, dart in excited(Robot(joint_friction_nm=friction), postures(1, seed=3)[0]):
+        p, p_dart = mujoco.tool_motion()[:3], dart.tool_motion()[:3]
+        positions.append(p)
+        errors.append(np.linalg.norm(p - p_dart))
+        readings.append((mujoco.sensor_wrench(), dart.sensor_wrench()))
+    assert np.ptp(positions, axis=0).max() > 0.02
+    assert np.max(errors) < 2e-4
+    mujoco_read, dart_read = np.array(readings[50:]).transpose(1, 0, 2)
+    difference = np.quantile(np.abs(mujoco_read - dart_read), part, axis=0)
+    assert np.ptp(dart_read, axis=0)[:3].max() > 20
+    assert difference[:3].max() < 0.2, "N, of the F/T sensor, while the tool is accelerated"
+    assert difference[3:].max() < 0.02, "N m"
+
+
+MS = 1_000_000
+STILL = np.zeros(7)
+
+
+class Arm:
+    """A plant that follows positions."""
+
+    def __init__(self, plant: type) -> None:
+        self.plant = plant(Robot())
+        self.loop = PositionLoop(ARM, self.plant.q)
+
+    def step(self, command: np.ndarray | None, force_W: np.ndarray | None = None, age: int = 0) -> np.ndarray:
+        gravity = self.plant.gravity_torque()
+        torque = self.loop.torque(command, self.plant.q, self.plant.v, gravity, age)
+        assert (np.abs(torque + gravity - self.loop.damping * self.plant.v) <= ARM.torque_nm + 1e-9).all()
+        self.plant.step(gravity + torque, force_W, np.zeros(3), self.loop.damping)
+        return self.plant.q - HOME
+
+
+@pytest.mark.parametrize("plant", [DartPlant, MujocoPlant])
+def test_a_ramp_is_followed_after_the_latency(plant: type) -> None:
+    arm, speed = Arm(plant), 0.3
+    for k in range(500):
+        moved = arm.step(HOME + speed * k * DT)
+    np.testing.assert_allclose(moved, speed * (499 * DT - TUNING.latency_ns / NS), atol=1.5e-3)
+    assert np.abs(arm.plant.v - speed).max() < 0.02
+
+
+def test_late_and_missed_commands_do_not_jerk_it() -> None:
+    """By the wall clock commands come late, in bursts, and not all of them."""
+    arm, speed, ages = Arm(DartPlant), 0.3, np.random.default_rng(1)
+    newest = 0
+    for k in range(500):
+        if k - newest > ages.integers(1, 12):
+            newest = k
+        arm.step(HOME + speed * newest * DT, age=(k - newest) * MS)
+        if k > 200:
+            assert np.abs(arm.plant.v - speed).max() < 0.02
+
+
+@pytest.mark.parametrize("plant", [DartPlant, MujocoPlant])
+def test_a_load_hardly_moves_it(plant: type) -> None:
+    arm = Arm(plant)
+    for _ in range(400):
+        moved = arm.step(HOME, np.array((0.0, 0.0, 15.0)))
+    assert 1e-5 < np.abs(moved).max() < 1e-3
+
+
+def test_without_commands_it_stops_within_its_acceleration() -> None:
+    arm = Arm(DartPlant)
+    for k in range(300):
+        before = arm.step(HOME + 0.5 * k * DT)
+    for _ in range(300):
+        after = arm.step(None)
+    assert np.abs(arm.plant.v).max() < 2e-3
+    braking = 0.5**2 / (2 * TUNING.acceleration_factor * ARM.acceleration_radps2)
+    np.testing.assert_allclose(after - before, braking, atol=0.01)
+
+
+def test_the_largest_jump_that_the_driver_takes_is_followed_within_the_limits() -> None:
+    arm, jump = Arm(DartPlant), 0.02
+    for _ in range(400):
+        moved = arm.step(HOME + jump)
+        assert (np.abs(arm.plant.v) <= 1.05 * ARM.velocity_radps).all()
+        assert (moved < 1.5 * jump).all()
+    np.testing.assert_allclose(moved, jump, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "cause"),
+    [
+        (HOME + 0.5, HoldCause.INVALID_COMMAND),
+        (np.where(np.arange(7) == 2, np.nan, HOME), HoldCause.INVALID_COMMAND),
+        (np.where(np.arange(7) == 2, 4.0, HOME), HoldCause.POSITION_LIMIT),
+        (np.zeros(0), HoldCause.INVALID_COMMAND),
+    ],
+)
+def test_the_driver_refuses_positions_that_cannot_be(wanted: np.ndarray, cause: HoldCause) -> None:
+    driver = Driver(ARM, 40.0, positions=True)
+    update = {"q": HOME, "v": STILL, "gravity": STILL, "force": 0.0, "lost": False}
+    np.testing.assert_array_equal(driver.update(MS, command=Command(HOME + 0.01, MS, 50 * MS), **update), HOME + 0.01)
+    driver.update(2 * MS, command=Command(wanted, 2 * MS, 50 * MS), **update)
+    assert (driver.mode, driver.cause) == (DriverMode.SAFE_HOLD, cause)

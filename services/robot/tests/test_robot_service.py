@@ -91,17 +91,17 @@ def test_sensor_topic_carries_weight_and_bias_until_tared(rig: Rig) -> None:
 
 
 def test_status_carries_the_means_since_the_last_one(rig: Rig) -> None:
+    def measured(joints: Any, force: Any, torque: Any) -> list[float]:
+        return [*joints.position, *joints.velocity, *vector(force), *vector(torque)]
+
     rig.tick()
     seen = []
     for _ in range(10):
         rig.servo(1, lbr.HOME + 0.05)
-        joints, wrench = rig.outbox["joint_states"], rig.outbox["ft/wrench"].wrench
-        seen.append([*joints.position, *joints.velocity, wrench.force.x, wrench.force.z, wrench.torque.y])
-    mean = np.mean(seen, axis=0)
-    np.testing.assert_allclose(rig.status.position, mean[:7], atol=1e-12)
-    np.testing.assert_allclose(rig.status.velocity, mean[7:14], atol=1e-12)
-    wrench = rig.status.wrench
-    np.testing.assert_allclose([wrench.force.x, wrench.force.z, wrench.torque.y], mean[14:], atol=1e-12)
+        wrench = rig.outbox["ft/wrench"].wrench
+        seen.append(measured(rig.outbox["joint_states"], wrench.force, wrench.torque))
+    reported = measured(rig.status, rig.status.wrench.force, rig.status.wrench.torque)
+    np.testing.assert_allclose(reported, np.mean(seen, axis=0), atol=1e-12)
 
 
 def test_a_soft_stop_does_not_hold_the_driver(rig: Rig) -> None:

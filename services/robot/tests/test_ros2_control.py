@@ -46,8 +46,7 @@ class Ros2Bench:
             self.status = outbox.get("robot/status", self.status)
             self.states = self.driver._states
             if self._start is None and "joint_states" in outbox:
-                self._start, begun = outbox["joint_states"].position.copy(), self.t
-                self._begun = begun
+                self._start, self._begun = outbox["joint_states"].position.copy(), self.t
             if self._start is not None:
                 self.inbox.messages["control/joint_torque"] = self._command()
 
