@@ -266,9 +266,6 @@ def test_joint_setpoints_determine_their_acceleration_within_bounds() -> None:
     assert guide.at(20 * MS).motion.qdd == pytest.approx(np.full(7, TUNING.max_acceleration_radps2))
 
 
-MS = 1_000_000
-
-
 def simulate(
     plant: Plant, robot: Robot, at: Callable[[int], Reference], ticks: int, external: External = no_force, *, late: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
