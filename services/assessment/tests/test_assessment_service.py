@@ -1,6 +1,7 @@
 """The service, driven by states of a sphere that slides over the real tissue, and whole scans on a few seeds."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,7 @@ from palpate.report.evidence import map_of
 from palpate.report.rows import finding_rows
 from palpate.report.scoring import Truth, score
 from palpate_assessment.service import MAP, AssessmentService, create
-from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, SurfaceMesh, SurfaceMotion, Vector3, header, nanoseconds
-from palpate_bus.messages.codec import encode
+from palpate_bus.messages import ExamState, SurfaceMotion, Vector3, header, nanoseconds
 from palpate_bus.service import Outbox
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.scenario.load import exam_input
@@ -46,10 +45,8 @@ def test_finds_the_lesion(truth: Truth, examined: Examined) -> None:
     stiffness_map, findings, samples = examined
     s = score(finding_rows(findings.findings), map_of(stiffness_map), truth)
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
-    assert s.place_error_m is not None
-    assert s.place_error_m < 0.005
-    assert s.dice is not None
-    assert s.dice > 0.8
+    assert s.place_error_m is not None and s.place_error_m < 0.005
+    assert s.dice is not None and s.dice > 0.8
     assert findings.final
     assert findings.findings[0].quadrant == "RLQ"
     assert len(samples) > 150
@@ -60,27 +57,9 @@ def test_apparent_stiffness_is_what_presses_feel(truth: Truth, examined: Examine
     found = map_of(stiffness_map)
     true = truth.felt.force(found.vertices[:, :2])
     pressed = found.scanned & np.isfinite(true)
-    away = pressed & (np.linalg.norm(found.vertices[:, :2] - (-0.012, -0.01), axis=1) > 0.045)
-    assert np.median(found.apparent[away] / true[away]) == pytest.approx(1.0, abs=0.06)
-    over = pressed & (np.linalg.norm(found.vertices[:, :2] - (-0.012, -0.01), axis=1) < 0.01)
-    assert np.median(found.apparent[over] / true[over]) == pytest.approx(1.0, abs=0.15)
-
-
-def test_every_vertex_has_an_interval_about_its_stiffness_and_its_finding(examined: Examined) -> None:
-    stiffness_map, _, _ = examined
-    n = len(stiffness_map.apparent)
-    assert len(stiffness_map.vertices) == 3 * n
-    assert stiffness_map.triangles.max() < n
-    assert (stiffness_map.lower < stiffness_map.apparent).all()
-    assert (stiffness_map.apparent < stiffness_map.upper).all()
-    assert set(np.unique(stiffness_map.finding)) == {-1, 0}
-
-
-def test_the_same_states_give_the_same_bytes(small: Scan, examined: Examined) -> None:
-    types = contract().topics
-    for a, b in zip(examined[:2], examine(small)[:2], strict=True):
-        name = "assessment/map" if hasattr(a, "apparent") else "assessment/findings"
-        assert encode(a, types[name].type) == encode(b, types[name].type)
+    away = np.linalg.norm(found.vertices[:, :2] - (-0.012, -0.01), axis=1)
+    for there, error in ((pressed & (away > 0.045), 0.06), (pressed & (away < 0.01), 0.15)):
+        assert np.median(found.apparent[there] / true[there]) == pytest.approx(1.0, abs=error)
 
 
 def played(service: AssessmentService, states: Sequence[Any], surface: Any = None) -> list[tuple[int, Outbox]]:
@@ -114,7 +93,7 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
     service = AssessmentService(exam_input(small.scenario))
     played(service, small.states[: len(small.states) // 2], small.surface)
     last = small.states[-1]
-    aborted = ExamState(**{**vars(last), "phase": ExamState.PHASE_ABORTED})
+    aborted = replace(last, phase=ExamState.PHASE_ABORTED)
     outbox = service.step(60_000_000_000, StepInbox({"exam/state": [aborted]}))
     assert outbox["assessment/findings"].final
     assert 0.2 < outbox["assessment/map"].scanned.mean() < 0.8
@@ -125,7 +104,7 @@ def test_what_was_felt_while_a_patient_moved_is_forgotten(small: Scan) -> None:
     half = len(small.states) // 2
     played(service, small.states[:half])
     before = service.finish()["samples"]
-    moved = [ExamState(**{**vars(state), "patient_moved": True}) for state in small.states[half:]]
+    moved = [replace(state, patient_moved=True) for state in small.states[half:]]
     played(service, [moved[0], moved[0]])
     after = service.finish()["samples"]
     assert 0 < after < before
@@ -135,8 +114,7 @@ def test_what_was_felt_while_a_patient_moved_is_forgotten(small: Scan) -> None:
 
 def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
     service = create(small.scenario)
-    wrong = type(small.surface)(**vars(small.surface))
-    wrong.header = type(small.surface.header)(small.surface.header.stamp, "camera")
+    wrong = replace(small.surface, header=replace(small.surface.header, frame_id="camera"))
     with pytest.raises(ValueError, match="perception/surface"):
         service.step(0, StepInbox({"perception/surface": [wrong]}))
 
@@ -145,13 +123,10 @@ def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) ->
     """The breath that was seen counts for each state, however many images came since."""
     states = small.states[:1500]
     first, last = (nanoseconds(states[k].header.stamp) for k in (0, -1))
-    mesh = small.surface
-    share = np.ones(len(mesh.vertices) // 3, np.float32)
-    surface = SurfaceMesh(mesh.header, mesh.vertices, mesh.normals, mesh.triangles, share)
+    surface = replace(small.surface, breathing=np.ones(len(small.surface.vertices) // 3, np.float32))
+    rest = (np.zeros(11), 1e-4, Vector3(0.0, 0.0, 0.0))
     motions = [
-        SurfaceMotion(
-            header(t, "abdomen"), SurfaceMotion.QUIET, 0.003 * np.sin(t / 6e8), np.zeros(11), 1e-4, Vector3(0.0, 0.0, 0.0)
-        )
+        SurfaceMotion(header(t, "abdomen"), SurfaceMotion.QUIET, 0.003 * np.sin(t / 6e8), *rest)
         for t in range(first, last, 100_000_000)
     ]
     known = exam_input(small.scenario)
@@ -174,8 +149,7 @@ def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) ->
 def test_healthy_has_no_finding(seed: int) -> None:
     s = scored(scan(scenario_with((), seed)))
     assert s.false_findings == 0
-    assert s.coverage_90 is not None
-    assert s.coverage_90 > 0.75
+    assert s.coverage_90 is not None and s.coverage_90 > 0.75
 
 
 @pytest.mark.slow
@@ -183,7 +157,5 @@ def test_healthy_has_no_finding(seed: int) -> None:
 def test_a_lesion_anywhere_is_found(seed: int) -> None:
     s = scored(scan(scenario_with((random_lesion(seed),), seed)))
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
-    assert s.dice is not None
-    assert s.dice > 0.7
-    assert s.place_error_m is not None
-    assert s.place_error_m < 0.012
+    assert s.dice is not None and s.dice > 0.7
+    assert s.place_error_m is not None and s.place_error_m < 0.012
