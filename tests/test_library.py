@@ -40,9 +40,6 @@ def patient() -> palpate.Patient:
     return palpate.Patient(palpate.scenario("clean", exam=SMALL))
 
 
-# --- names ---------------------------------------------------------------------------------------------------------------
-
-
 def test_nothing_is_imported_before_it_is_used_and_packages_do_not_hide_functions() -> None:
     subprocess.run([sys.executable, "-c", LAZY], check=True, timeout=120)
 
@@ -61,9 +58,8 @@ def test_the_examples_hold(module: str) -> None:
 
 
 def test_keywords_are_the_settings_of_the_command_line() -> None:
-    by_keywords = palpate.scenario(
-        "clean", seed=3, exam={"depth_m": 0.008, "pattern": "raster"}, **{"phantom.breathing.kind": "deep"}
-    )
+    given = {"exam": {"depth_m": 0.008, "pattern": "raster"}, "phantom.breathing.kind": "deep"}
+    by_keywords = palpate.scenario("clean", seed=3, **given)
     words = ["exam.depth_m=0.008", "exam.pattern=raster", "phantom.breathing.kind=deep"]
     assert dump_scenario(by_keywords) == dump_scenario(load_scenario("clean", words, 3))
 
@@ -140,11 +136,10 @@ def test_the_scenario_of_the_assessment_does_not_depend_on_the_patient() -> None
 
 
 def test_an_assessment_needs_touches_of_one_patient(patient: palpate.Patient) -> None:
-    other = palpate.Patient(patient.scenario)
-    with pytest.raises(ValueError, match="several patients"):
-        palpate.assess([*presses(patient, 1), *presses(other, 1)])
-    with pytest.raises(ValueError, match="there are none"):
-        palpate.assess([])
+    of_two = [*presses(patient, 1), *presses(palpate.Patient(patient.scenario), 1)]
+    for touches, named in ((of_two, "several patients"), ([], "there are none")):
+        with pytest.raises(ValueError, match=named):
+            palpate.assess(touches)
 
 
 def test_the_order_of_touches_does_not_matter_and_few_give_no_map() -> None:
@@ -152,8 +147,8 @@ def test_the_order_of_touches_does_not_matter_and_few_give_no_map() -> None:
     there, back = palpate.assess(touches), palpate.assess(reversed(touches))
     assert np.array_equal(there.map.apparent, back.map.apparent)
     assert there.samples.equals(back.samples)
-    assert palpate.assess(touches[0]).map is None
-    assert len(palpate.assess(touches[0]).findings) == 0
+    few = palpate.assess(touches[0])
+    assert (few.map, len(few.findings)) == (None, 0)
 
 
 def test_a_lump_is_found_while_the_hand_follows_the_breath() -> None:
@@ -174,10 +169,8 @@ def test_the_assessment_is_the_one_that_the_scenario_names() -> None:
 
 @pytest.mark.slow
 def test_an_examination_is_that_of_the_command_line(tmp_path: Path) -> None:
-    region = {"region_m": [0.03, 0.03], "centre_m": [-0.055, -0.055]}
-    made = palpate.run(
-        "clean", out=tmp_path / "made", record="none", quiet=True, exam=region, phantom={"edge_m": 0.02}, camera={"frames": 2}
-    )
+    given = {"exam": {**SMALL, "region_m": [0.03, 0.03]}, "phantom": {"edge_m": 0.02}, "camera": {"frames": 2}}
+    made = palpate.run("clean", out=tmp_path / "made", record="none", quiet=True, **given)
     command = palpate_run("clean", tmp_path / "command", "--composed", "--record", "none", settings=TINY)
     assert made.report.run_hash == command.report["run_hash"] is not None
 
@@ -187,16 +180,12 @@ def test_an_examination_is_that_of_the_command_line(tmp_path: Path) -> None:
 def test_a_study_gives_its_tables(tmp_path: Path) -> None:
     file = tmp_path / "toy.yaml"
     file.write_text("tier: quick\npopulations: {clean: {scenario: clean, number: {test: 2}}}\n", encoding="utf-8")
-    region = {"region_m": [0.03, 0.03]}
     with pytest.raises(ValueError, match="nosuch"):
         palpate.study(file, methods=["nosuch"])
-    done = palpate.study(file, number=1, workers=1, out=tmp_path / "done", exam=region)
-    assert done.record.done == 1
-    assert len(done.cases) == 1
-    assert done.page.is_file()
-    again = palpate.study(file, number=1, workers=1, out=tmp_path / "done", exam=region)
-    assert again.record.digest == done.record.digest
-    assert len(again.record.sessions) == 1
+    given = {"number": 1, "workers": 1, "out": tmp_path / "done", "exam": {"region_m": [0.03, 0.03]}}
+    done, again = (palpate.study(file, **given) for _ in range(2))
+    assert (done.record.done, len(done.cases), done.page.is_file()) == (1, 1, True)
+    assert (again.record.digest, len(again.record.sessions)) == (done.record.digest, 1)
 
 
 # --- notebooks -----------------------------------------------------------------------------------------------------------
