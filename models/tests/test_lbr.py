@@ -3,7 +3,6 @@
 from xml.etree import ElementTree
 
 import numpy as np
-import pinocchio
 import pinocchio as pin
 import pytest
 import trimesh
@@ -11,6 +10,7 @@ import trimesh
 from palpate_models.robot import arm as robot_arm, lbr
 from palpate_models.robot.arm import TOOL, link_names, link_transforms, tool_pose, urdf
 from palpate_models.robot.chain import Capsule
+from palpate_models.robot.fitting import enclosing_capsule
 from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot
@@ -27,14 +27,9 @@ def test_masses_are_the_published_ones() -> None:
     robot = Robot(tool_mass_kg=0.5)
     inertias = robot_arm.inertias(robot)
     assert sum(inertias[f"lbr_link_{i}"].mass for i in range(8)) == pytest.approx(23.9, abs=1e-5)
-    below_sensor = inertias["ft_sensor"].mass + inertias["indenter"].mass
-    assert below_sensor == pytest.approx(robot.tool_mass_kg)
-    total = sum(float(link.find("inertial/mass").get("value")) for link in _links(robot) if link.find("inertial"))
+    assert inertias["ft_sensor"].mass + inertias["indenter"].mass == pytest.approx(robot.tool_mass_kg)
+    total = sum(float(mass.attrib["value"]) for mass in ElementTree.fromstring(urdf(robot)).iter("mass"))
     assert total == pytest.approx(23.9 + TOOL.ft_sensor_mass_kg + robot.tool_mass_kg, abs=1e-5)
-
-
-def _links(robot: Robot) -> list[ElementTree.Element]:
-    return list(ElementTree.fromstring(urdf(robot)).iter("link"))
 
 
 def test_joints_and_links_have_the_names_of_the_ros2_stack(model: pin.Model) -> None:
@@ -91,14 +86,13 @@ def test_collision_primitives_are_the_capsules(model: pin.Model) -> None:
 
 
 ROBOT = Robot(base_yaw_rad=0.3)
-POSES = [lbr.HOME, np.linspace(-1, 1, 7), np.full(7, 0.4)]
 
 
-@pytest.mark.parametrize("q", POSES)
+@pytest.mark.parametrize("q", [lbr.HOME, np.linspace(-1, 1, 7), np.full(7, 0.4)])
 def test_every_link_is_where_the_urdf_has_it(q: np.ndarray) -> None:
-    model = pinocchio.buildModelFromXML(urdf(ROBOT))
+    model = pin.buildModelFromXML(urdf(ROBOT))
     data = model.createData()
-    pinocchio.framesForwardKinematics(model, data, q)
+    pin.framesForwardKinematics(model, data, q)
     X = np.eye(4)
     for parent, child, X_PC in link_transforms(q, ROBOT):
         assert parent == "world" or model.existFrame(parent)
@@ -112,15 +106,10 @@ def _corners(box: Box) -> np.ndarray:
     return signs * box.size @ box.X_WB[:3, :3].T + box.X_WB[:3, 3]
 
 
-@pytest.fixture
-def named() -> dict[str, Box]:
-    return {box.name: box for box in boxes(Robot())}
-
-
-def test_table_top_spans_what_the_scene_says(named: dict[str, Box]) -> None:
-    corners = _corners(named["table_top"])
-    np.testing.assert_allclose(corners.max(axis=0), [0.835, 1.0, 0.73])
-    np.testing.assert_allclose(corners.min(axis=0)[:2], [0.285, -1.0])
+def test_table_top_spans_what_the_scene_says() -> None:
+    (top,) = (box for box in boxes(Robot()) if box.name == "table_top")
+    np.testing.assert_allclose(_corners(top).max(axis=0), [0.835, 1.0, 0.73])
+    np.testing.assert_allclose(_corners(top).min(axis=0)[:2], [0.285, -1.0])
 
 
 def test_base_carries_the_robot_and_clears_the_table() -> None:
@@ -155,6 +144,13 @@ def _outside(points: np.ndarray, capsules: tuple[Capsule, ...]) -> float:
         share = np.clip((points - start) @ axis / max(axis @ axis, 1e-12), 0.0, 1.0)
         distances.append(np.linalg.norm(points - start - share[:, None] * axis, axis=1) - capsule.radius)
     return float(np.min(distances, axis=0).max())
+
+
+def test_a_fitted_capsule_encloses_its_points() -> None:
+    rng = np.random.default_rng(1)
+    for scale in rng.uniform(0.02, 0.5, (20, 3)):
+        points = rng.standard_normal((200, 3)) * scale + rng.uniform(-1, 1, 3)
+        assert _outside(points, (enclosing_capsule(points),)) < 1e-9
 
 
 @pytest.mark.parametrize("link", LINKS[1:8])

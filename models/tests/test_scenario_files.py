@@ -34,10 +34,7 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("exam: {depth_m: deep}", r"mine\.yaml, line 1: exam\.depth_m = 'deep': .*number"),
-        (
-            "seed: 1\nexam:\n  depht_m: 0.01\n",
-            r"mine\.yaml, line 3: exam\.depht_m = 0\.01: unknown field\. Did you mean depth_m\?",
-        ),
+        ("seed: 1\nexam:\n  depht_m: 0.01\n", r"line 3: exam\.depht_m = 0\.01: unknown field\. Did you mean depth_m\?"),
         ("exam: {pattern: snak}", r"exam\.pattern = 'snak': .*lines, raster, snake, search, or the path.*mean snake\?"),
         ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0 = .*centre_m"),
         ("seed: 1\nexam: 3\n", r"mine\.yaml, line 2: exam = 3: .*section"),
@@ -65,6 +62,10 @@ def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
         (["exam.region_m=0.1"], r"exam\.region_m = 0\.1: expected a list"),
         (["exam.region_m=[0.1]"], r"exam\.region_m = \[0\.1\]: expected at least 2 values"),
         (["exam.region_m=[0.1, 0.1, 0.1]"], r"exam\.region_m = .*: expected at most 2 values"),
+        (["limits.speed_mps=500"], r"limits\.speed_mps = 500"),
+        (["limits.depth_m=20"], r"limits\.depth_m = 20"),
+        (["limits.force_emergency_n=40000"], r"limits\.force_emergency_n = 40000"),
+        (["limits.workspace_min_m=[0.8, 0, 0]"], "expected -3 <= min < max <= 3"),
         (["errors=bad"], r"errors\.level = 'bad': .*'none', 'typical' or 'poor'"),
         (["errors=5"], r"errors = 5: .*none, typical or poor"),
         (["errors.level=[poor]"], r"errors\.level = \['poor'\]"),
@@ -77,16 +78,17 @@ def test_a_value_is_blamed_on_the_setting_that_wrote_it_with_unit_and_count(sett
         load_scenario("lump", settings)
 
 
-def test_a_file_that_is_not_there_and_a_folder_are_no_names(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"mine\.yaml: there is no such file"):
-        load_scenario(str(tmp_path / "mine.yaml"))
-    with pytest.raises(ScenarioError, match="is a folder"):
-        load_scenario(str(tmp_path))
-
-
-def test_a_scenario_that_is_not_there_is_guessed() -> None:
-    with pytest.raises(ScenarioError, match=r"helthy: no such scenario.*Did you mean healthy\?"):
-        load_scenario("helthy")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("mine.yaml", r"mine\.yaml: there is no such file"),
+        ("", "is a folder"),
+        ("helthy", r"helthy: no such scenario.*Did you mean healthy\?"),
+    ],
+)
+def test_a_scenario_that_is_not_there_is_refused(tmp_path: Path, name: str, said: str) -> None:
+    with pytest.raises(ScenarioError, match=said):
+        load_scenario(name if name == "helthy" else str(tmp_path / name))
 
 
 def test_a_merged_section_may_be_overridden(tmp_path: Path) -> None:
@@ -143,35 +145,36 @@ def test_what_is_drawn_has_the_size_that_is_said() -> None:
     errors = Errors(level="poor")
     drawn = [draw_errors(errors, seed) for seed in range(MANY)]
     force, camera, arm = errors.force, errors.camera, errors.arm
-    rough = {"rel": 0.1}
-    share = np.array([d.force.sensitivity for d in drawn])
-    assert share[:, range(6), range(6)].std() == pytest.approx(force.gain, **rough)
-    assert share[:, 0, 1].std() == pytest.approx(force.cross_talk, **rough)
-    assert share[:, 3, 0].std() == pytest.approx(force.cross_talk * MOMENT_PER_FORCE_M, **rough)
-    bias = np.array([d.force.bias for d in drawn])
-    assert 0.98 * force.bias_n < np.abs(bias[:, :3]).max() <= force.bias_n
-    assert 0.98 * force.bias_nm < np.abs(bias[:, 3:]).max() <= force.bias_nm
-    assert np.std([d.force.warm_up[:3] for d in drawn]) == pytest.approx(force.warm_up_n, **rough)
-    offsets = np.abs([d.camera.offset_m for d in drawn])
-    assert 0.95 * camera.offset_m < offsets.max() <= camera.offset_m
-    assert np.mean([len(d.camera.lost) for d in drawn]) == pytest.approx(camera.lost_patches, **rough)
+    share, bias = (np.array([getattr(d.force, name) for d in drawn]) for name in ("sensitivity", "bias"))
+    spread = {
+        "gain": (share[:, range(6), range(6)], force.gain),
+        "cross talk": (share[:, 0, 1], force.cross_talk),
+        "cross talk of a moment": (share[:, 3, 0], force.cross_talk * MOMENT_PER_FORCE_M),
+        "warm-up": ([d.force.warm_up[:3] for d in drawn], force.warm_up_n),
+        "origins": ([d.arm.origin_m for d in drawn], arm.length_m),
+        "zeros": ([d.arm.zero_rad for d in drawn], arm.zero_rad),
+        "friction": (np.log([d.arm.friction for d in drawn]), arm.friction),
+        "damping": (np.log([d.arm.damping for d in drawn]), arm.damping),
+        "tool": (np.log([d.arm.tool_mass for d in drawn]), arm.tool_mass),
+    }
     for poses, asked in (("X_CCt", errors.hand_eye), ("X_AAt", errors.registration)):
         X = np.array([getattr(d, poses) for d in drawn])
-        assert X[:, :3, 3].std() == pytest.approx(asked.translation_m, **rough)
-        assert Rotation.from_matrix(X[:, :3, :3]).as_rotvec().std() == pytest.approx(asked.rotation_rad, **rough)
-    assert np.std([d.arm.origin_m for d in drawn]) == pytest.approx(arm.length_m, **rough)
-    assert np.std([d.arm.zero_rad for d in drawn]) == pytest.approx(arm.zero_rad, **rough)
-    assert np.log([d.arm.friction for d in drawn]).std() == pytest.approx(arm.friction, **rough)
-    assert np.log([d.arm.damping for d in drawn]).std() == pytest.approx(arm.damping, **rough)
-    assert np.log([d.arm.tool_mass for d in drawn]).std() == pytest.approx(arm.tool_mass, **rough)
+        spread[f"place of {poses}"] = (X[:, :3, 3], asked.translation_m)
+        spread[f"turn of {poses}"] = (Rotation.from_matrix(X[:, :3, :3]).as_rotvec(), asked.rotation_rad)
+    for name, (values, size) in spread.items():
+        assert np.std(values) == pytest.approx(size, rel=0.1), name
+    assert np.mean([len(d.camera.lost) for d in drawn]) == pytest.approx(camera.lost_patches, rel=0.1)
+    uniform = ((bias[:, :3], force.bias_n), (bias[:, 3:], force.bias_nm), ([d.camera.offset_m for d in drawn], camera.offset_m))
+    for values, size in uniform:
+        assert 0.95 * size < np.abs(values).max() <= size
 
 
 def test_without_errors_the_equipment_is_nominal_but_for_the_bias() -> None:
     drawn = draw_errors(Errors(level="none"), 3)
-    np.testing.assert_array_equal(drawn.force.sensitivity, np.eye(6))
-    np.testing.assert_array_equal(drawn.X_CCt, np.eye(4))
-    np.testing.assert_array_equal(drawn.X_AAt, np.eye(4))
-    for values, nominal in ((drawn.arm.origin_m, 0), (drawn.arm.zero_rad, 0), (drawn.arm.friction, 1), (drawn.arm.damping, 1)):
+    arm = drawn.arm
+    for values in (drawn.force.sensitivity, drawn.X_CCt, drawn.X_AAt):
+        np.testing.assert_array_equal(values, np.eye(len(values)))
+    for values, nominal in ((arm.origin_m, 0), (arm.zero_rad, 0), (arm.friction, 1), (arm.damping, 1)):
         np.testing.assert_array_equal(values, np.full(np.shape(values), nominal))
     assert (drawn.camera.offset_m, drawn.camera.warm_up_m, len(drawn.camera.lost), drawn.arm.tool_mass) == (0, 0, 0, 1)
     assert np.abs(drawn.force.bias).max() > 0

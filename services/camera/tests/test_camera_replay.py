@@ -60,31 +60,25 @@ def test_it_conforms_to_the_role_camera(recording: Path) -> None:
     assert report.passed, [result for result in report.results if result.verdict == "failed"]
 
 
-def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(
+def test_it_shows_the_recorded_pixels_in_their_order_the_small_ones_unasked_and_goes_round(
     recording: Path, seen: dict[str, list[ReceivedMessage]]
 ) -> None:
     rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     rig.run(2.0, {})
     assert not rig.log[IMAGE], "nothing unasked"
+    assert len(rig.log[SMALL_IMAGE]) == len(rig.log[SMALL_INFO]) >= 20
+    for received, small in zip(rig.log[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
+        np.testing.assert_array_equal(received.message.data, small.message.data)
+        assert nanoseconds(received.message.header.stamp) == received.t
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES + 1))
     shown = rig.run(1.0, {})
     recorded = [received.message for received in seen[IMAGE]]
-    assert len(recorded) == FRAMES
     assert len(shown[IMAGE]) == len(shown[INFO]) == FRAMES + 1
     for received, info, then in zip(shown[IMAGE], shown[INFO], [*recorded, recorded[0]], strict=True):
         np.testing.assert_array_equal(received.message.data, then.data)
         assert nanoseconds(received.message.header.stamp) == nanoseconds(info.message.header.stamp) == received.t
         assert received.t >= 2000 * MS
     assert rig.last(POSE) == seen[POSE][-1].message
-
-
-def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, seen: dict[str, list[ReceivedMessage]]) -> None:
-    rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
-    shown = rig.run(0.5, {})
-    assert len(shown[SMALL_IMAGE]) == len(shown[SMALL_INFO]) >= 5
-    for received, then in zip(shown[SMALL_IMAGE], seen[SMALL_IMAGE], strict=False):
-        np.testing.assert_array_equal(received.message.data, then.message.data)
-        assert nanoseconds(received.message.header.stamp) == received.t
 
 
 def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(
@@ -180,16 +174,13 @@ def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[Rece
         ReplayedCamera(open_recording(folder))
 
 
-def test_no_recording_is_refused_by_field() -> None:
-    with pytest.raises(RecordingError, match=r"camera\.recording"):
-        create(SCENARIO)
-
-
 def test_a_run_checks_the_recording_before_anything_starts(tmp_path: Path) -> None:
     (tmp_path / "bag_0.db3").write_bytes(b"SQLite format 3\0" + bytes(99))
     changed = {
         "camera": SCENARIO.camera.model_copy(update={"recording": str(tmp_path)}),
         "services": SCENARIO.services.model_copy(update={"camera": "replay"}),
     }
+    with pytest.raises(RecordingError, match=r"camera\.recording"):
+        create(SCENARIO)
     with pytest.raises(RecordingError, match="SQLite bag"):
         check_choices(SCENARIO.model_copy(update=changed))

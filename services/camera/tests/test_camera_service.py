@@ -42,34 +42,29 @@ SMALL = {"camera/follow/depth", "camera/follow/camera_info"}
 WHOLE = {"camera/depth/image_raw", "camera/depth/camera_info"}
 
 
-def test_small_images_until_triggered_then_whole_ones_too() -> None:
+SURFACE, ASKED = {"sim/surface": plate()}, "planning/camera_trigger"
+
+
+@pytest.mark.parametrize(
+    ("received", "whole"),
+    [
+        ([SURFACE, {ASKED: trigger(3)}, {}, {}, {}, {}], [0, 1, 1, 1, 0, 0]),
+        ([SURFACE | {ASKED: trigger(50)}, {ASKED: trigger(2)}, {}, {}], [1, 1, 1, 0]),  # a new trigger replaces the burst
+        ([{ASKED: trigger(1)}, SURFACE], [None, 1]),  # it waits for the first surface
+    ],
+)
+def test_small_images_until_triggered_then_whole_ones_too(received: list[dict[str, Any]], whole: list[int | None]) -> None:
     camera, inbox = CameraService(plant_input(Scenario())), HandInbox()
-    assert set(camera.step(0, inbox.receive({"sim/surface": plate()}))) == SMALL
-    sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(3)}))]
-    sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300, 400, 500)]
-    assert [set(outbox) for outbox in sent] == [SMALL | WHOLE] * 3 + [SMALL] * 2
-    stamps = [nanoseconds(outbox["camera/depth/image_raw"].header.stamp) for outbox in sent[:3]]
-    assert stamps == [100 * MS, 200 * MS, 300 * MS]
-    assert camera.finish() == {"bursts": 1, "frames": 3}
-
-
-def test_a_new_trigger_replaces_the_burst() -> None:
-    camera, inbox = CameraService(plant_input(Scenario())), HandInbox()
-    camera.step(0, inbox.receive({"sim/surface": plate(), "planning/camera_trigger": trigger(50)}))
-    sent = [camera.step(100 * MS, inbox.receive({"planning/camera_trigger": trigger(2)}))]
-    sent += [camera.step(t * MS, inbox.receive({})) for t in (200, 300)]
-    assert [set(outbox) for outbox in sent] == [SMALL | WHOLE] * 2 + [SMALL]
-
-
-def test_a_burst_waits_for_the_first_surface() -> None:
-    camera, inbox = CameraService(plant_input(Scenario())), HandInbox()
-    assert camera.step(0, inbox.receive({"planning/camera_trigger": trigger(1)})) == {}
-    assert set(camera.step(100 * MS, inbox.receive({"sim/surface": plate()}))) >= WHOLE
+    sent = [camera.step(100 * k * MS, inbox.receive(messages)) for k, messages in enumerate(received)]
+    assert [set(outbox) for outbox in sent] == [set() if k is None else SMALL | WHOLE if k else SMALL for k in whole]
+    stamps = [nanoseconds(outbox["camera/depth/image_raw"].header.stamp) for outbox in sent if set(outbox) >= WHOLE]  # type: ignore[union-attr]
+    assert stamps == [100 * k * MS for k, taken in enumerate(whole) if taken]
+    assert camera.finish()["frames"] == len(stamps)
 
 
 def test_the_small_image_is_every_seventh_pixel_of_the_whole_one() -> None:
     service = CameraService(plant_input(scenario(camera={"noise_scale": 0.0, "field_m": 0.01, "lost_patches": 30.0})))
-    sent = service.step(0, HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1)}))
+    sent = service.step(0, HandInbox().receive(SURFACE | {ASKED: trigger(1)}))
     whole, small = (depth(sent[topic]) for topic in ("camera/depth/image_raw", "camera/follow/depth"))
     assert small.shape == (69, 91)
     np.testing.assert_allclose(small, whole[3::7, 3::7], atol=1e-5)
@@ -79,17 +74,14 @@ def test_the_small_image_is_every_seventh_pixel_of_the_whole_one() -> None:
 
 def test_the_small_image_is_as_noisy_as_the_whole_one() -> None:
     noisy, ideal = (CameraService(plant_input(scenario(camera={"noise_scale": scale}))) for scale in (1.0, 0.0))
-    once, always = (HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(40)}) for _ in range(2))
-    errors: dict[str, list[np.ndarray]] = {"camera/depth/image_raw": [], "camera/follow/depth": []}
-    true = ideal.step(0, once)
-    for k in range(40):
-        sent = noisy.step(k * 100 * MS, always)
-        always.receive({})
-        for topic, seen in errors.items():
-            middle = tuple(slice(int(0.48 * size), int(0.52 * size)) for size in depth(true[topic]).shape)
-            seen.append((depth(sent[topic]) - depth(true[topic]))[middle].ravel())
-    whole, small = (float(np.nanstd(np.concatenate(seen))) for seen in errors.values())
-    assert small == pytest.approx(whole, rel=0.1)
+    once, always = (HandInbox().receive(SURFACE | {ASKED: trigger(40)}) for _ in range(2))
+    true, sent = ideal.step(0, once), [noisy.step(0, always)]
+    sent += [noisy.step(k * 100 * MS, always.receive({})) for k in range(1, 40)]
+    spread = []
+    for topic in ("camera/depth/image_raw", "camera/follow/depth"):
+        middle = tuple(slice(int(0.48 * size), int(0.52 * size)) for size in depth(true[topic]).shape)
+        spread.append(float(np.nanstd([(depth(outbox[topic]) - depth(true[topic]))[middle] for outbox in sent])))
+    assert spread[1] == pytest.approx(spread[0], rel=0.1)
 
 
 def test_images_use_the_true_pose_and_messages_the_calibrated_one() -> None:
@@ -102,8 +94,8 @@ def test_images_use_the_true_pose_and_messages_the_calibrated_one() -> None:
     p = nominal.transform.translation
     np.testing.assert_allclose((p.x, p.y, p.z), Scenario().camera.position_m)
     assert other == nominal
-    asked = {"sim/surface": plate(), "planning/camera_trigger": trigger(1)}
-    near, far = (depth(service.step(0, HandInbox().receive(asked))["camera/depth/image_raw"]) for service in (good, bad))
+    received = SURFACE | {ASKED: trigger(1)}
+    near, far = (depth(service.step(0, HandInbox().receive(received))["camera/depth/image_raw"]) for service in (good, bad))
     middle = near.shape[0] // 2, near.shape[1] // 2  # the optical axis
     assert far[middle] - near[middle] == pytest.approx(0.04, abs=1e-4)
 
@@ -111,13 +103,12 @@ def test_images_use_the_true_pose_and_messages_the_calibrated_one() -> None:
 def test_a_link_before_the_abdomen_hides_it() -> None:
     X = np.eye(4)
     X[:3, 3] = 0.6, -0.1, 1.1
-    links = TFMessage([transform(0, "world", "lbr_link_4", X)])
-    pictures = []
-    for poses in ({}, {"sim/link_poses": links}):
+
+    def picture(poses: dict[str, Any]) -> np.ndarray:
         service = CameraService(plant_input(scenario(camera={"noise_scale": 0.0})))
-        inbox = HandInbox().receive({"sim/surface": plate(), "planning/camera_trigger": trigger(1), **poses})
-        pictures.append(depth(service.step(0, inbox)["camera/depth/image_raw"]))
-    without, with_link = pictures
+        return depth(service.step(0, HandInbox().receive(SURFACE | {ASKED: trigger(1), **poses}))["camera/depth/image_raw"])
+
+    without, with_link = picture({}), picture({"sim/link_poses": TFMessage([transform(0, "world", "lbr_link_4", X)])})
     nearer = with_link < without - 0.05
     assert 1000 < nearer.sum() < 60_000
     untouched = ~nearer & np.isfinite(without)
@@ -127,7 +118,7 @@ def test_a_link_before_the_abdomen_hides_it() -> None:
 def test_a_surface_in_another_frame_is_refused() -> None:
     service = create(Scenario())
     with pytest.raises(ValueError, match=r"sim/surface: header.frame_id = 'abdomen', expected 'world'"):
-        service.step(0, HandInbox().receive({"sim/surface": plate(frame="abdomen"), "planning/camera_trigger": trigger(1)}))
+        service.step(0, HandInbox().receive({"sim/surface": plate(frame="abdomen"), ASKED: trigger(1)}))
 
 
 PINHOLE = Pinhole(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -136,15 +127,8 @@ X_WC = look_at(np.array([0.3, -0.4, 1.2]), np.array([0.05, 0.02, 0.0]))
 
 def flat_plate(height: float, half: float = 3.0, at: tuple[float, float] = (0.0, 0.0)) -> Mesh:
     """Return a horizontal square."""
-    x, y = at
-    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
-    vertices = np.array([(x + a, y + b, height) for a, b in corners])
-    return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], np.uint32))
-
-
-def ball(centre: tuple[float, float, float], radius: float) -> Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=5, radius=radius)
-    return Mesh(np.asarray(shape.vertices) + centre, shape.faces.astype(np.uint32))
+    (x, y), corners = at, ((-half, -half), (half, -half), (half, half), (-half, half))
+    return Mesh(np.array([(x + a, y + b, height) for a, b in corners]), np.array([(0, 1, 2), (0, 2, 3)], np.uint32))
 
 
 def rays() -> np.ndarray:
@@ -156,7 +140,8 @@ def rays() -> np.ndarray:
 
 def test_depth_of_a_sphere_is_analytic() -> None:
     centre, radius = np.array([0.05, 0.02, 0.2]), 0.25
-    view = Scene(PINHOLE, X_WC).cast(ball(tuple(centre), radius))
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    view = Scene(PINHOLE, X_WC).cast(Mesh(np.asarray(ball.vertices) + centre, ball.faces.astype(np.uint32)))
     direction, offset = rays(), X_WC[:3, 3] - centre
     a = np.sum(direction**2, axis=2)
     b = direction @ offset
