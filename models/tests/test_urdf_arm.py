@@ -215,13 +215,15 @@ def test_an_arm_of_a_larger_robot_begins_at_its_base(tmp_path: Path) -> None:
     lift = '<joint name="lift" type="prismatic"><parent link="trunk"/><child link="link_0"/></joint>'
     mount = '<joint name="other" type="fixed"><parent link="trunk"/><child link="mount"/></joint>'
     body = f'<link name="trunk">{INERTIAL.format(**GOOD)}</link><link name="mount"/>{lift}{mount}</robot>'
-    alone, _ = read_arm(write(tmp_path))
-    part, faults = read_arm(write(tmp_path, base="link_0", **swap("</robot>", body)))
+    for folder in ("alone", "part", "whole"):
+        (tmp_path / folder).mkdir()
+    alone, _ = read_arm(write(tmp_path / "alone"))
+    part, faults = read_arm(write(tmp_path / "part", base="link_0", **swap("</robot>", body)))
     assert alone is not None
     assert part is not None, faults
     assert (part.link_names, part.inertias) == (alone.link_names, alone.inertias)
     np.testing.assert_array_equal(part.origin_m, alone.origin_m)
-    assert "write `base: LINK`" in read_arm(write(tmp_path, **swap("</robot>", body)))[1][0]
+    assert "write `base: LINK`" in read_arm(write(tmp_path / "whole", **swap("</robot>", body)))[1][0]
 
 
 def test_a_home_posture_is_found(tmp_path: Path) -> None:

@@ -144,11 +144,6 @@ def photograph(frames: int = 1, seed: int = 0, **given: float) -> np.ndarray:
     return np.array([np.frombuffer(out["camera/depth/image_raw"].data, "<f4").reshape(BIAS_SHAPE) for out in sent])
 
 
-def shared(images: np.ndarray, later: np.ndarray) -> float:
-    """Return the correlation of images of mean 0."""
-    return float(np.mean(images * later) / np.sqrt(np.mean(images**2) * np.mean(later**2)))
-
-
 def test_a_unit_is_off_by_its_own_constant() -> None:
     one, other = (photograph(seed=seed, offset_m=0.02)[0] - photograph()[0] for seed in (1, 2))
     np.testing.assert_allclose(one[np.isfinite(one)], drawn(1, offset_m=0.02).offset_m, atol=1e-6)
@@ -184,14 +179,15 @@ def test_the_wander_has_its_size_everywhere_and_neighbours_share_it() -> None:
     spread = images.std(axis=0)
     assert spread.mean() == pytest.approx(0.001, rel=0.05)
     assert spread[::10].mean() == pytest.approx(spread[5::10].mean(), rel=0.05)
-    assert shared(images[..., 2:], images[..., :-2]) > 0.9
-    assert abs(shared(images[..., 60:], images[..., :-60])) < 0.05
+    near, far = (np.mean(images[..., px:] * images[..., :-px]) / np.mean(images**2) for px in (2, 60))
+    assert near > 0.9
+    assert abs(far) < 0.05
 
 
 def test_frames_share_the_wander_for_its_time_and_the_mean_of_many_keeps_it() -> None:
     camera = bias(1, wander_m=0.001, wander_s=5.0)
     images = np.array([camera.image(0.1 * k, NO_SKIN) for k in range(400)])
-    kept = [shared(images[frames:], images[:-frames]) for frames in (1, 50)]
+    kept = [np.mean(images[frames:] * images[:-frames]) / np.mean(images**2) for frames in (1, 50)]
     np.testing.assert_allclose(kept, np.exp(np.array((-0.02, -1.0))), atol=0.1)
     assert images[:20].mean(axis=0).std() > 0.85e-3
     assert bias(1, wander_m=0.001, wander_s=1e-3).image(0.1, NO_SKIN).std() == pytest.approx(1e-3, rel=0.1)
