@@ -414,7 +414,8 @@ class ExaminationSequence:
 
     def _hold(self, now: Observation, out: ExamStep) -> Setpoint | None:
         setpoint = self._stops.step(now)
-        self._views.asked = None  # a burst that was requested before the stop is requested again
+        # What was asked for before the stop is asked for again: the arm may have been pushed since.
+        self._views.asked = self._planning = None
         return self._palpate(now, out) if self.status.phase in PALPATING else setpoint
 
     # --- after contact ------------------------------------------------------------------------------------------------

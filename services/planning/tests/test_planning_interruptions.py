@@ -56,6 +56,16 @@ def test_after_a_release_it_resumes_without_losses(phase: Phase, soft: bool) -> 
     assert max(row[5] for row in world.rows) < 5.0, "after the stop the force is not larger"
 
 
+def test_an_arm_that_was_pushed_while_the_strokes_were_planned_starts_where_it_is() -> None:
+    world = stopped_in(Phase.PLAN, soft=False)
+    for _ in range(100):
+        world.q = world.q + np.array([0.0025, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        world.step()
+    world.stop = NO_CAUSE
+    world.run(lambda: world.exam.status.phase is Phase.INDENT)
+    check_at_port(world.setpoints)
+
+
 def test_a_soft_stop_in_contact_retreats_along_the_normal_and_waits() -> None:
     world = stopped_in(Phase.SCAN, soft=True, seconds=0.8)
     assert world.pressed == 0.0
