@@ -166,7 +166,9 @@ class Recovery:
     def __init__(self, exam: Exam, limits: Limits, period_s: float) -> None:
         self._exam, self._limits, self._period_s = exam, limits, period_s
         self._soft_stops = 0
-        self._spoiled_at, self._repeats = 0.0, 0
+        self._spoiled: tuple[Segment | None, float] = None, 0.0
+        """Stroke that was interrupted last, and the path length there [m]."""
+        self._repeats = 0
         self.paused = False
         """True if the arm has to wait above the wall."""
         self.resume_at: float | None = None
@@ -206,8 +208,9 @@ class Recovery:
 
     def repeat(self, segment: Segment, s: float, back: float, cause: Cause) -> None:
         """Take the stroke up again `back` [m] before path length s; skip its rest after too many repeats at one place."""
-        again = self._repeats > 0 and s < self._spoiled_at + RECOVERY.one_place_m
-        self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
+        spoiled, spoiled_at = self._spoiled
+        again = segment is spoiled and s < spoiled_at + RECOVERY.one_place_m
+        self._spoiled, self._repeats = (segment, s), self._repeats + 1 if again else 1
         self.take_up(s, back)
         if self._repeats > RECOVERY.repeats_max:
             self.give_up_place(segment, s, cause)
@@ -215,7 +218,7 @@ class Recovery:
     def give_up_place(self, segment: Segment, s: float, cause: Cause) -> None:
         """Skip a stroke from path length s on."""
         self._skip(segment, segment.path.visits > s - 1e-6, cause)
-        self.resume_at, self._repeats = None, 0
+        self.resume_at = None
 
     def _skip(self, segment: Segment, visits: Mask, cause: Cause) -> None:
         """Skip targets, unless the wall is only touched there: they are pressed later."""

@@ -1,6 +1,7 @@
 """Tests of stops, pushes and unexpected motion of the wall: the examination waits, resumes or ends."""
 
 from collections import deque
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Following
-from palpate_planning.interruptions import WALL, WallWatch
+from palpate_planning.interruptions import RECOVERY, WALL, Recovery, WallWatch
 from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.palpation import NOT_TRACKED
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.stroke import StrokeStage
@@ -259,6 +261,19 @@ def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
     pressed = [depth > 0.002 for *_, depth, _ in world.rows]
     assert sum(pressed) * 0.01 < 2 * WALL.gate_closed_max_s
     assert world.exam.status.cause.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
+
+
+def test_repeats_of_one_stroke_do_not_count_against_the_next() -> None:
+    settings, visits = known(), np.array((0.0, 0.2))
+    recovery = Recovery(settings.exam, settings.limits, PERIOD_S)
+    first, second = (Mock(touch=False, path=Mock(visits=visits, targets=np.array(targets))) for targets in ((0, 1), (2, 3)))
+    for _ in range(RECOVERY.repeats_max):
+        recovery.repeat(first, 0.19, 0.01, NOT_TRACKED)
+    recovery.repeat(second, 0.0, 0.0, NOT_TRACKED)
+    assert not recovery.skipped
+    for _ in range(RECOVERY.repeats_max):
+        recovery.repeat(second, 0.0, 0.0, NOT_TRACKED)
+    assert set(recovery.skipped) == {2, 3}
 
 
 def test_a_push_while_the_skin_is_only_touched_skips_no_target() -> None:
