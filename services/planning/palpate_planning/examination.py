@@ -27,7 +27,7 @@ from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
-from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits
+from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits, Tally
 from palpate_planning.wall.wall import Wall, plane
 
 
@@ -141,7 +141,7 @@ class ExaminationSequence:
         """State of the examination."""
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart, self._return_to_arm = RestartRamp(), ReturnToArm(step_s, rates)
-        self._approach_waits = StrokeWaits(step_s)
+        self._approach_waits, self._tally = StrokeWaits(step_s, Tally()), Tally()
         self._views = Views(look_postures(known))
         self._remainder = Remainder()
         self._requested = RequestedPresses(lockstep=lockstep)
@@ -348,7 +348,9 @@ class ExaminationSequence:
                 self.status.cause, self.status.message = waits.reported, waits.reported.text
         elif now.t - course.since >= EXAM.rest_ns:
             assert course.plan is not None
-            course.palpation = Palpation(course.plan.segments, known, self._step_s, self._sense.wall, self.status.stroke)
+            course.palpation = Palpation(
+                course.plan.segments, known, self._step_s, self._sense.wall, self._tally, self.status.stroke
+            )
             course.palpation.more, course.palpation.looked_again = course.plan.presses is not None, self._remainder.looked_again
             return self._palpate(now, out)
         return None

@@ -17,6 +17,7 @@ from palpate_planning.stroke import Duration
 from palpate_planning.stroke_motion import MOTION
 from palpate_planning.strokes.path import PathPoint, centre
 from palpate_planning.strokes.segments import Segment
+from palpate_planning.waits import Tally
 from palpate_planning.wall.breath import Breath
 
 
@@ -88,11 +89,10 @@ class ForceWatch:
 class WallWatch:
     """Checks that the wall is tracked and touched; one `step` each planning period."""
 
-    def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
-        self._breath, self._gated = breath, following is Following.GATE
+    def __init__(self, breath: Breath, following: Following, period_s: float, tally: Tally) -> None:
+        self._breath, self._gated, self._tally = breath, following is Following.GATE, tally
         self._tracked = Duration(period_s, WALL.calm_s)
         self._contact_lost, self._occluded, self._gate_closed = Duration(period_s), Duration(period_s), Duration(period_s)
-        self._losses = 0
         self.spoiled = False
         """True if present samples are invalid: the indenter has to lift off."""
         self.leaps = False
@@ -124,15 +124,15 @@ class WallWatch:
         self._occluded.update(breath.hidden and not tracked and not on_free_motion)
         lost = self._contact_lost.update(contact_lost) > WALL.contact_lost_s
         if lost:
-            self._losses += 1
+            self._tally.contact_losses += 1
             self._contact_lost.update(False)
         self.spoiled = lost or not calm
         self.leaps = not (tracked or breath.hidden)
         self.moved = self.moved or breath.moved
         if self.moved:
             self.ended = MOVED
-        elif self._losses >= WALL.contact_losses_max:
-            self.ended = Cause(Reason.CONTACT_LOST, f"contact was lost {self._losses} times")
+        elif (losses := self._tally.contact_losses) >= WALL.contact_losses_max:
+            self.ended = Cause(Reason.CONTACT_LOST, f"contact was lost {losses} times")
 
 
 class Displacement:
@@ -163,9 +163,9 @@ class Displacement:
 class Recovery:
     """State of interrupted strokes: where they continue, which targets are skipped, or the cause that ends them."""
 
-    def __init__(self, exam: Exam, limits: Limits, period_s: float) -> None:
+    def __init__(self, exam: Exam, limits: Limits, period_s: float, tally: Tally) -> None:
         self._exam, self._limits, self._period_s = exam, limits, period_s
-        self._soft_stops = 0
+        self.tally = tally
         self._spoiled: tuple[Segment | None, float] = None, 0.0
         """Stroke that was interrupted last, and the path length there [m]."""
         self._repeats = 0
@@ -194,13 +194,13 @@ class Recovery:
     def soft_stop(self, force: float, segment: Segment, s: float) -> None:
         """Skip the targets near path length s; abandon the strokes at the last allowed soft stop."""
         path = segment.path
-        self._soft_stops += 1
+        self.tally.soft_stops += 1
         cause = Cause(Reason.FORCE, f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N")
         self._skip(segment, (path.visits > s - 1e-6) & (path.visits < s + self._exam.spacing_m), cause)
         ahead = path.visits[path.visits >= s + self._exam.spacing_m]
         self.resume_at = float(ahead[0]) if len(ahead) else None
-        if self._soft_stops >= RECOVERY.soft_stops_max:
-            self.failed = cause._replace(text=f"{cause.text}, {self._soft_stops} times")
+        if (stops := self.tally.soft_stops) >= RECOVERY.soft_stops_max:
+            self.failed = cause._replace(text=f"{cause.text}, {stops} times")
 
     def take_up(self, s: float, back: float) -> None:
         """Take the stroke up again `back` [m] before path length s."""

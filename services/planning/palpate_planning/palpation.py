@@ -26,7 +26,7 @@ from palpate_planning.reasons import Cause
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_REQUEST, FOR_WALL, StrokeWaits, Wait
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_REQUEST, FOR_WALL, StrokeWaits, Tally, Wait
 from palpate_planning.wall.wall import PublishedTouch, Wall
 
 
@@ -73,7 +73,9 @@ class Palpation:
     An interruption lifts the tool; then the segment is resumed.
     """
 
-    def __init__(self, segments: tuple[Segment, ...], known: ExamInput, period_s: float, wall: Wall, strokes: int = 0) -> None:
+    def __init__(
+        self, segments: tuple[Segment, ...], known: ExamInput, period_s: float, wall: Wall, tally: Tally, strokes: int = 0
+    ) -> None:
         """Start with the first segment.
 
         Args:
@@ -81,6 +83,7 @@ class Palpation:
             known: examination, limits, arm and tool.
             period_s: planning period [s].
             wall: what is pressed; every touch corrects it.
+            tally: counts of the plans before, which these strokes continue.
             strokes: descents made before.
         """
         exam, limits = known.exam, known.limits
@@ -94,10 +97,10 @@ class Palpation:
         self.looked_again = False
         """True if the surface was scanned again because no tissue was felt."""
         self._blind_places = 0
-        self._watch = WallWatch(wall.breath, exam.breathing, period_s)
+        self._watch = WallWatch(wall.breath, exam.breathing, period_s, tally)
         self._forces = ForceWatch(period_s)
-        self.recovery = Recovery(exam, limits, period_s)
-        self.waits, self._strokes_before = StrokeWaits(period_s), strokes
+        self.recovery = Recovery(exam, limits, period_s, tally)
+        self.waits, self._strokes_before = StrokeWaits(period_s, tally), strokes
         self.ahead: frozenset[int] = frozenset()
         """The targets that are left when the strokes end early."""
         self.bend_needed = 0.0

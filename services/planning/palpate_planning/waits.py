@@ -1,5 +1,6 @@
 """Waits of the examination: for what, from when on they are reported, and when they end."""
 
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from palpate_bus.messages.codes import Reason
@@ -80,12 +81,21 @@ FOR_PERCEPTION: Final = Cause(Reason.WAITS_FOR_PERCEPTION, "waiting for the surf
 FOR_FINDINGS: Final = Cause(Reason.WAITS_FOR_FINDINGS, "waiting for the findings", "assessment")
 
 
+@dataclass(slots=True)
+class Tally:
+    """Counts that a new plan continues: their limits hold for all strokes of the examination."""
+
+    soft_stops: int = 0
+    contact_losses: int = 0
+    waited_s: dict[Wait, float] = field(default_factory=dict)
+    """Time of each wait since the strokes last made progress."""
+
+
 class StrokeWaits:
     """Counts the time in which the arm waits since the strokes last made progress."""
 
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._waited_s: dict[Wait, float] = {}
+    def __init__(self, period_s: float, tally: Tally) -> None:
+        self._period_s, self._waited_s = period_s, tally.waited_s
         self._segment, self._position = -1, 0.0
         """The furthest place reached: number of the segment and path length [m]."""
         self.pressed = False

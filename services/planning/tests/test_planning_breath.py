@@ -14,6 +14,7 @@ from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import Cause
 from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.waits import Tally
 from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
 
 DT = 0.01
@@ -60,7 +61,7 @@ def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
 
 def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
     breath = Breath()
-    watch = WallWatch(breath, Following.FOLLOW, DT)
+    watch = WallWatch(breath, Following.FOLLOW, DT, Tally())
     breath.receive(motion(0, 0.0, calm=False), 0)
     watch.step(0, contact_lost=False)
     assert watch.spoiled and not watch.calm
@@ -73,7 +74,7 @@ def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
 
 
 def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
-    watch = WallWatch(Breath(), Following.FOLLOW, DT)
+    watch = WallWatch(Breath(), Following.FOLLOW, DT, Tally())
     losses = steps = 0
     while not watch.ended:
         watch.step(0, contact_lost=True)
@@ -85,7 +86,7 @@ def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
 
 def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> None:
     breath = Breath()
-    watch = WallWatch(breath, Following.FOLLOW, DT)
+    watch = WallWatch(breath, Following.FOLLOW, DT, Tally())
     breath.receive(motion(0, 0.0, calm=False)._replace(seen=False), 0)
     for leaving, hidden in ((True, False), (False, True), (True, False)):
         for _ in range(round(1.1 * WALL.hidden_timeout_s / DT)):
@@ -95,7 +96,7 @@ def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> N
 
 def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
     breath = Breath()
-    watch = WallWatch(breath, Following.GATE, DT)
+    watch = WallWatch(breath, Following.GATE, DT, Tally())
     for displacement, open_ in ((0.0, True), (0.006, False)):
         breath.receive(motion(0, displacement), 0)
         watch.step(SECOND, contact_lost=False)
@@ -179,13 +180,16 @@ def moved_in_the_second_stroke(*answers: PerceivedAbdomen | Cause) -> World:
 
 def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     world = moved_in_the_second_stroke()
-    strokes = world.exam.status.stroke
+    strokes, first = world.exam.status.stroke, world.exam._course.palpation
     assert world.exam.status.phase is Phase.LOOK
     world.shift_A = (0.008, -0.003)
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
     status = world.exam.status
     assert status.stroke > strokes
     assert not status.patient_moved
+    second = world.exam._course.palpation
+    assert first is not None and second is not None
+    assert second.recovery.tally is first.recovery.tally, "a new plan does not renew the limits"
     foot = world.exam._course.contact.foot
     place = world.exam._sense.wall.perceived.xy(world.exam._course.contact.wall_point[0])
     assert place == pytest.approx(foot.xy_A - (0.008, -0.003), abs=5e-4)

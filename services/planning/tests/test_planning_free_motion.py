@@ -26,7 +26,7 @@ from palpate_planning.stroke_motion import MOTION as STROKE_MOTION, StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath
 from palpate_planning.strokes.plan import ExamPlanner
 from palpate_planning.strokes.segments import Segment
-from palpate_planning.waits import WAIT
+from palpate_planning.waits import WAIT, Tally
 from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import WallEstimate, plane
 
@@ -77,7 +77,7 @@ def palpated(times: list[int]) -> list[Setpoint]:
 def free_palpation() -> Palpation:
     """Return a palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
-    return Palpation((segment, segment), known(), PERIOD_S, plane(np.eye(4)))
+    return Palpation((segment, segment), known(), PERIOD_S, plane(np.eye(4)), Tally())
 
 
 def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:

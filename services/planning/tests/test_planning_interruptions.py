@@ -18,6 +18,7 @@ from palpate_planning.palpation import NOT_TRACKED
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.stroke import StrokeStage
+from palpate_planning.waits import Tally
 from palpate_planning.wall.breath import Breath, BreathObservation
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
@@ -237,7 +238,7 @@ def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
 
 def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> None:
     breath = Breath()
-    watch = WallWatch(breath, Following.GATE, 0.1)
+    watch = WallWatch(breath, Following.GATE, 0.1, Tally())
     inspired = BreathObservation(0, np.full(11, 0.006), 1e-4, calm=True)
     for k in range(round((WALL.gate_closed_max_s + 5) / 0.1)):
         t = k * 100_000_000
@@ -263,9 +264,19 @@ def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
     assert world.exam.status.cause.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
 
 
+def test_soft_stops_are_counted_over_all_plans() -> None:
+    settings, tally = known(), Tally()
+    segment = Mock(touch=False, path=Mock(visits=np.zeros(1), targets=np.zeros(1, dtype=int)))
+    for _ in range(RECOVERY.soft_stops_max):
+        recovery = Recovery(settings.exam, settings.limits, PERIOD_S, tally)
+        assert not recovery.failed
+        recovery.soft_stop(26.0, segment, 0.0)
+    assert recovery.failed.text.endswith("3 times")
+
+
 def test_repeats_of_one_stroke_do_not_count_against_the_next() -> None:
     settings, visits = known(), np.array((0.0, 0.2))
-    recovery = Recovery(settings.exam, settings.limits, PERIOD_S)
+    recovery = Recovery(settings.exam, settings.limits, PERIOD_S, Tally())
     first, second = (Mock(touch=False, path=Mock(visits=visits, targets=np.array(targets))) for targets in ((0, 1), (2, 3)))
     for _ in range(RECOVERY.repeats_max):
         recovery.repeat(first, 0.19, 0.01, NOT_TRACKED)

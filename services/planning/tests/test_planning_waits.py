@@ -19,7 +19,7 @@ from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.status import OVER, Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.requests import PressRequest
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits, Tally
 
 SMALL = {"region_m": (0.025, 0.0125)}
 STILL_RAD = 1e-6
@@ -207,7 +207,7 @@ def test_a_slow_planner_is_not_awaited_for_ever() -> None:
 
 
 def test_only_progress_begins_the_count_again() -> None:
-    counted, ends = StrokeWaits(1.0), []
+    counted, ends = StrokeWaits(1.0, Tally()), []
     counted.reach(1, 0.0, at_depth=True)
     for k in range(200):
         counted.reach(1, 0.9 * WAIT.progress_m * (k % 2), at_depth=True)
