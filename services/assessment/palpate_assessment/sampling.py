@@ -99,18 +99,22 @@ class Sampler:
         self._block: list[ContactState] = []
         self._before: deque[ContactState] = deque(maxlen=PRESS.states)
         self._onset: float | None = None
+        self._counted = False
+        """True once a state of this touch has counted: a later rest is not its press, but a wait for the breath in its slide."""
 
     def add(self, state: ContactState) -> ForceSample | None:
         """Take the next state; return the sample that it completes, if any."""
         if not state.in_contact:
-            sample, self._onset = self._average(), None
-            self._before.clear()
+            sample = self._average()
+            self.forget()
             return sample
         if self._onset is None:
             self._onset = state.time
         if not state.counts:
-            self._before.append(state)
+            if not self._counted:
+                self._before.append(state)
             return self._average()
+        self._counted = True
         self._block.append(state)
         if self._before:
             return self._press(state)
@@ -121,7 +125,7 @@ class Sampler:
 
     def forget(self) -> None:
         """Forget the states of a sample that is not complete, and the touch."""
-        self._block, self._onset = [], None
+        self._block, self._onset, self._counted = [], None, False
         self._before.clear()
 
     def _press(self, state: ContactState) -> ForceSample | None:

@@ -56,6 +56,13 @@ def test_a_press_held_before_a_slide_is_a_sample() -> None:
     assert all(s.exponent == 0 for s in hurried)
 
 
+def test_a_wait_for_the_breath_in_a_slide_is_no_press() -> None:
+    slide = [state(k, x=0.0003 * k) for k in range(100)]
+    wait = [state(100 + k, x=0.03, counts=False) for k in range(250)]
+    onward = [state(350 + k, x=0.03 + 0.0003 * (k + 2)) for k in range(100)]
+    assert all(sample.velocity[0] > 0.02 for sample in run(slide + wait + onward))
+
+
 def test_time_in_contact_restarts_with_each_stroke() -> None:
     gap = [state(100, depth=-0.01, counts=False, touching=False)]
     first, second = ([state(start + k, x=x + 0.0003 * k) for k in range(100)] for start, x in ((0, 0.0), (101, 0.05)))
