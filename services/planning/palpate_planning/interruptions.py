@@ -230,11 +230,11 @@ class Recovery:
         self.early_end = cause
         self.skipped |= dict.fromkeys(targets, cause)
 
-    def measured_length(self, position: float, *, slid: bool) -> float:
-        """Return the path length up to which the present stroke has been measured [m]; before its first target if it has not."""
+    def measured_length(self, position: float, *, measured: bool) -> float:
+        """Return the path length up to which the present stroke has been measured [m]: with `position`, or up to just before it."""
         if self.resume_at is not None:
             return self.resume_at - MOTION.end_tolerance_m
-        return position - (0.0 if slid else MOTION.end_tolerance_m)
+        return position - (0.0 if measured else MOTION.end_tolerance_m)
 
     def begin_return(self, contact: ContactMeasurement, point: PathPoint, centre_height: float) -> float:
         """Begin the return of the arm to its path point; return its lateral distance [m] from there.

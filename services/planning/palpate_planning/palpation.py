@@ -97,6 +97,8 @@ class Palpation:
         self.looked_again = False
         """True if the surface was scanned again because no tissue was felt."""
         self._blind_places = 0
+        self._pressed = False
+        """True once the present stroke has been pressed to its end."""
         self._watch = WallWatch(wall.breath, exam.breathing, period_s, tally)
         self._forces = ForceWatch(period_s)
         self.recovery = Recovery(exam, limits, period_s, tally)
@@ -131,8 +133,8 @@ class Palpation:
         segment, later = self._motion.segment, self._later
         if not measures_targets(segment):
             return later
-        slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
-        reached = self.recovery.measured_length(self._motion.along.position, slid=slid)
+        measured = self._pressed or self.stage is StrokeStage.SLIDE
+        reached = self.recovery.measured_length(self._motion.along.position, measured=measured)
         behind = TUNING.unnoticed_m if self._watch.moved else 0.0
         return later.union(segment.path.targets[segment.path.visits > reached - behind].tolist())
 
@@ -251,6 +253,7 @@ class Palpation:
             self._number += 1
             segment = self._segments[self._number]
             self._motion.start(segment)
+            self._pressed = False
             if segment.free is not None:
                 yield from stroke.follow(self._motion)
             elif segment.contact:
@@ -278,6 +281,7 @@ class Palpation:
     def _press(self) -> stroke.Stages[None]:
         """Press along the present segment, from where the arm is."""
         cause = yield from stroke.press(self._motion, self.descent)
+        self._pressed = not cause
         self._blind_places = self._blind_places + 1 if cause.reason is Reason.NO_TISSUE else 0
         if cause.reason is Reason.NO_TISSUE:
             self._miss(cause)

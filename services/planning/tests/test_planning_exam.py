@@ -51,6 +51,12 @@ def test_snake_goes_through_all_phases_in_order(snake: World) -> None:
     assert snake.exam.status.target_index == 11
 
 
+def test_after_the_last_stroke_no_target_is_left(snake: World) -> None:
+    palpation = snake.exam._course.palpation
+    assert palpation is not None
+    assert not palpation.remaining
+
+
 def test_depth_is_true_while_samples_count(snake: World) -> None:
     steady = np.array([(row[3], row[4]) for row in snake.rows if row[1]])
     assert len(steady) > 300
