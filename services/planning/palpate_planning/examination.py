@@ -26,7 +26,7 @@ from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observa
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
-from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
+from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures, nearest_targets
 from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits, Tally
 from palpate_planning.wall.wall import Wall, plane
 
@@ -267,11 +267,12 @@ class ExaminationSequence:
     def _accept_view(self, now: Observation, perceived: PerceivedAbdomen) -> None:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
         course, remainder, sense, before = self._course, self._remainder, self._sense, self._before
-        course.perceived, self._averaged = perceived, None
-        if remainder.rescans:
+        if course.perceived is not None and remainder.rescans:
+            self._renumber(course.perceived, perceived)
             sense.wall.rescan(perceived.surface)
         else:
             sense.wall = Wall(perceived.surface, sense.wall.breath)
+        course.perceived, course.palpation, self._averaged = perceived, None, None
         count = self.status.target_count = len(perceived.positions)
         self.status.view_blocked = False
         text = f"planning over {count} targets"
@@ -287,6 +288,14 @@ class ExaminationSequence:
                 remainder.wanted = before.remaining_targets(targets, self._known.exam.spacing_m)
                 text = f"planning over {len(remainder.wanted)} of {count} targets that are left"
         course.enter(Phase.PLAN, now.t, text)
+
+    def _renumber(self, before: PerceivedAbdomen, perceived: PerceivedAbdomen) -> None:
+        """Give each target of a new view the state of the nearest one before."""
+        nearest = dict(enumerate(nearest_targets(before.positions, perceived.positions)))
+        wanted, skipped = self._remainder.wanted, self.skipped
+        if wanted is not None:
+            self._remainder.wanted = frozenset(i for i, was in nearest.items() if was in wanted)
+        self.skipped = {i: skipped[was] for i, was in nearest.items() if was in skipped}
 
     def _look_again(self, now: Observation, out: ExamStep, cause: Cause) -> None:
         status, exhausted = self.status, self._views.fail()

@@ -231,7 +231,7 @@ class Recovery:
         self.skipped |= dict.fromkeys(targets, cause)
 
     def measured_length(self, position: float, *, measured: bool) -> float:
-        """Return the path length up to which the present stroke has been measured [m]: with `position`, or up to just before it."""
+        """Return the path length up to which the present stroke has been measured [m]: to `position`, or to just before it."""
         if self.resume_at is not None:
             return self.resume_at - MOTION.end_tolerance_m
         return position - (0.0 if measured else MOTION.end_tolerance_m)

@@ -13,7 +13,7 @@ from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import Cause
-from palpate_planning.strokes.plan import PerceivedAbdomen
+from palpate_planning.strokes.plan import PerceivedAbdomen, nearest_targets
 from palpate_planning.waits import Tally
 from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
 
@@ -196,6 +196,12 @@ def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     world.run()
     assert status.phase is Phase.DONE
     assert status.targets_skipped == 0
+
+
+def test_targets_of_a_new_scan_are_known_by_their_places() -> None:
+    before = np.array([(0.01 * k, 0.0, 0.0) for k in range(5)])
+    assert nearest_targets(before, before[::-1] + 0.02) == [4, 3, 2, 1, 0]
+    assert nearest_targets(before, np.array([(0.005 * k, 0.001 * k, 0.0) for k in range(9)]))[::2] == [0, 1, 2, 3, 4]
 
 
 def test_a_patient_who_moved_out_of_view_is_assessed_from_the_samples_before() -> None:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array, Ints, apply, inverse, rigid
 from palpate_models.scenario.patterns import scan_of
@@ -144,6 +145,14 @@ class ExamPlanner:
             elif not scene.free(q):
                 skipped[i] = collision(scene, q)
         return chosen.q, skipped
+
+
+def nearest_targets(before: Array, targets: Array) -> list[int]:
+    """Return the index of the nearest target `before`, shape (k, 3), for each of `targets`, shape (n, 3), in world [m].
+
+    Both about their middle, since the patient has moved. A pattern that depends on the surface may have other targets then.
+    """
+    return [int(i) for i in cKDTree(before - before.mean(axis=0)).query(targets - targets.mean(axis=0))[1]]
 
 
 def look_postures(known: ExamInput, *, hidden: bool = True) -> list[Array]:
