@@ -80,7 +80,8 @@ def exam_states(measured_error: float) -> list[Any]:
             k * 10_000_000,
             msg.ExamState.PHASE_SCAN,
             (P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
-            **{"target_index": k, "target_count": 100, "targets_skipped": 2, "in_contact": True, "steady": k >= 10, "stroke": 1},
+            **{"target_index": max(k - 1, 0), "target_count": 100, "targets_skipped": 2, "stroke": 1},
+            **{"in_contact": True, "steady": k >= 10},
             **{"depth_setpoint": 0.01, "depth": 0.01 + measured_error, "normal_force": 2.5, "depth_uncertainty": 0.0005},
         )
         for k in range(100)

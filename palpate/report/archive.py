@@ -92,7 +92,7 @@ class Evidence:
     @cached_property
     def states(self) -> Any:
         """The exam states as a record array, shape (n,): time [s], phase (ExamState.PHASE_*), depth and setpoint [m], tared
-        normal force [N], flags, targets visited, skipped and in all.
+        normal force [N], flags, targets skipped and in all.
         """
         rows = ((nanoseconds(s.header.stamp) / NS, *_values(s)) for s in self.collected.exam_states)
         return np.fromiter(rows, [("time", "f8"), *((name, kind) for name, _, kind in _STATE)]).view(np.recarray)
@@ -133,7 +133,6 @@ _STATE: Final = (
     ("setpoint", "depth_setpoint", "f8"),
     ("force", "normal_force", "f8"),
     *((flag, flag, "?") for flag in ("in_contact", "steady", "force_limited")),
-    ("visited", "target_index", "u4"),
     ("skipped", "targets_skipped", "u4"),
     ("target_count", "target_count", "u4"),
 )

@@ -133,7 +133,7 @@ def _count_reached(report: Report, evidence: Evidence) -> int:
     """Return the number of targets that the indenter reached."""
     if not report.failure:
         return evidence.target_count - report.skipped_targets
-    return int(evidence.states.visited[-1]) if len(evidence.states) else 0
+    return evidence.collected.targets_reached
 
 
 def _finding_text(f: FindingRow) -> str:

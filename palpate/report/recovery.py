@@ -190,7 +190,6 @@ def _extend(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoi
         surface = apply(X_AW, points(c.surface))
         targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
         wanted = range(len(targets)) if earlier is None else earlier.remaining_targets(targets, run.scenario.exam.spacing_m)
-        latest = max((int(state.target_index) for state in c.exam_states if state.steady), default=0)  # its stroke starts there
-        left = targets[[i for i in sorted(wanted) if i >= latest]]
+        left = targets[[i for i in sorted(wanted) if i >= c.targets_reached - 1]]  # the stroke of the last one starts there
     strokes = max((int(state.stroke) for state in c.exam_states), default=0)
     return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)

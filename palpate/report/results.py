@@ -134,7 +134,7 @@ def _unfelt(scenario: Scenario, result: RunResult) -> dict[str, float]:
         return {Loss.FAULT: region * max(felt - len(result.collected.samples), 0) / exam.target_count}
     lost = result.counters.get("planning", {}).get("facts", {}).get("unfelt_targets")
     if lost is None and result.failure and not scenario.exam.searched:  # planning is lost, or the run was recovered
-        lost = {Loss.UNFINISHED: exam.target_count - exam.target_index}
+        lost = {Loss.UNFINISHED: exam.target_count - result.collected.targets_reached}
     lost = {Loss.NOT_REACHED: exam.targets_skipped} if lost is None else lost
     return {str(reason): region * count / exam.target_count for reason, count in lost.items() if count}
 

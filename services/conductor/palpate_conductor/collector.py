@@ -106,6 +106,11 @@ class Collected:
         return self.exam_states[-1] if self.exam_states else None
 
     @property
+    def targets_reached(self) -> int:
+        """Number of targets up to the last one that was measured."""
+        return max((int(state.target_index) + 1 for state in self.exam_states if state.steady), default=0)
+
+    @property
     def end_tick(self) -> int | None:
         """Simulated time [ns] at which the run ends; None until planning announces it, or says that the examination is over."""
         exam = self.exam
