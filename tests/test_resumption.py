@@ -6,6 +6,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -13,6 +14,8 @@ import pytest
 from examination import SHORT, TINY, Finished, command, palpate_run, service_process
 from scipy.spatial import KDTree
 
+from palpate.report import recovery
+from palpate.report.archive import EvidenceError
 from palpate.report.recovery import FOLDER
 from palpate_bus.messages.geometry import Array
 from palpate_bus.recordings import open_recording
@@ -99,6 +102,14 @@ def test_a_killed_examination_is_resumed_once(tmp_path: Path) -> None:
     again = resume(folder, "--composed")
     assert again.status == 2
     assert "was completed" in again.output
+
+
+def test_an_examination_of_a_patient_who_moved_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its samples are in the frame of its first scan."""
+    run = Mock(collected=Mock(exam_states=[Mock(patient_moved=moved) for moved in (False, True, False)]))
+    monkeypatch.setattr(recovery, "_runs", lambda folder: [run])
+    with pytest.raises(EvidenceError, match="the patient moved"):
+        recovery.resumption(tmp_path)
 
 
 @pytest.mark.slow

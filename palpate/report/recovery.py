@@ -116,13 +116,17 @@ class Resumption(NamedTuple):
 def resumption(folder: Path) -> Resumption:
     """Return the continuation of the run in `folder`, or of its latest continuation.
 
-    Raises EvidenceError if it was completed, is still active, or has no recording, no samples, or no targets left.
+    Raises EvidenceError if it was completed, is still active, or has no recording, no samples, or no targets left, or if the
+    patient moved: samples are in the frame of the first scan.
     """
     while _holds_run(folder / FOLDER):
         folder /= FOLDER
     if archive.read_completed(folder) is not None:
         raise archive.EvidenceError(f"--resume {folder}: its run was completed")
     runs = _runs(folder)
+    if any(state.patient_moved for run in runs for state in run.collected.exam_states):
+        moved = "the patient moved during the examination, so its samples do not fit a new scan"
+        raise archive.EvidenceError(f"--resume {folder}: {moved}; start a new run")
     reached = _last_checkpoint(runs)
     if not len(reached.felt.time):
         raise archive.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
