@@ -145,7 +145,7 @@ class Pipeline:
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
         nodes = scan.targets + shift  # step 5: the pattern gives places and their order
-        known = cloud.find_supported(p_A, nodes, self._exam.spacing_m)  # step 4: of those places, the ones with data
+        known = cloud.find_supported(p_A, nodes, self._exam.spacing_m)  # step 4: those without are only counted
         p_W, n_W = self._on(field, nodes)
         targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
 

@@ -90,7 +90,7 @@ class WallPixels(NamedTuple):
     lifts: Array
     """Mode at the pixels, shape (n,)."""
     r_W: Array
-    """Viewing rays of unit z in the camera's frame, shape (n, 3)."""
+    """Viewing rays of unit depth, in world axes, shape (n, 3)."""
     camera: Intrinsics
     """Intrinsics of the small image."""
 
