@@ -31,6 +31,8 @@ POLL_S: Final = 0.1
 SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 PARENT_S: Final = 2.0
 """Time within which the parent interrupts a child whose group of processes got a signal."""
+READ_S: Final = 5.0
+"""Time to read the rest of what a child sent before it ended. A process that it has started may keep its pipe open."""
 _LIBC: Final = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG: Final = 1
 _OVER: Final = object()
@@ -110,6 +112,8 @@ class _Child:
         self._pipe, theirs = Pipe(duplex=False)
         self._news: SimpleQueue[Any] = SimpleQueue()
         self._answer: tuple[str, Any] | None = None
+        self._unreadable: ChildLost | None = None
+        """Set when a message cannot be unpickled: no later one is read."""
         self._code: int | None = None
         self._interrupted = shared_numbers()
         """Its first number is 1 once the parent interrupts the child."""
@@ -132,13 +136,17 @@ class _Child:
         self._reader.start()
 
     def _read(self) -> None:
-        with suppress(EOFError, OSError, pickle.UnpicklingError):
+        try:
             while self._answer is None:
                 kind, value = self._pipe.recv()
                 if kind == "news":
                     self._news.put(value)
                 else:
                     self._answer = (kind, value)
+        except (EOFError, OSError):  # the child has ended, or closed its pipe
+            pass
+        except Exception as error:  # any: unpickling imports modules and runs code
+            self._unreadable = ChildLost(f"sent what cannot be read: {type(error).__name__}: {error}")
         self._news.put(_OVER)
 
     def result(self, receive: Callable[[Any], None], check: Callable[[], None]) -> Any:
@@ -147,7 +155,8 @@ class _Child:
                 try:
                     reading = self._reader.is_alive()
                     self._receive(receive)
-                    if not reading or self._ended(os.WNOHANG):
+                    answered = not reading and (self._answer or self._unreadable) is not None
+                    if answered or self._ended(os.WNOHANG):
                         break
                     check()
                 except KeyboardInterrupt:
@@ -156,16 +165,15 @@ class _Child:
                     self._interrupted[0] = 1
                     with suppress(ProcessLookupError):
                         os.kill(self.pid, signal.SIGTERM)
-            if self._answer is None:
-                self._ended(0)
-                self._reader.join(POLL_S)  # a process that the child has started may keep the pipe open
+            if reading:
+                self._reader.join(READ_S)
                 self._receive(receive)
         finally:
             if self._answer is None and not self._ended(os.WNOHANG):
                 os.kill(self.pid, signal.SIGKILL)
             self._ended(0)
         if self._answer is None:
-            raise ChildLost(describe_end(self._code or 0))
+            raise self._unreadable or ChildLost(describe_end(self._code or 0))
         kind, value = self._answer
         if kind == "raised":
             raise value

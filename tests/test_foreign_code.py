@@ -1,10 +1,13 @@
 """Services and files that exit, crash, hang or print: none takes the command or its output with it."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from time import sleep
 
@@ -12,7 +15,7 @@ import pytest
 from toy_runs import ROLES, composed_hash, run_toys, toy_services
 
 from palpate import apart
-from palpate.apart import ChildLost, Send, run_apart
+from palpate.apart import ChildLost, Send, TimeLimit, run_apart
 from palpate.check.perform import check_here
 from palpate.check.rig import RigSettings
 from palpate.run import composed
@@ -140,6 +143,36 @@ def test_a_signal_that_foreign_code_raises_is_no_interruption() -> None:
     with pytest.raises(ChildLost, match=r"raised signal 15 \(SIGTERM\) itself"):
         run_apart(lambda _: signal.raise_signal(signal.SIGTERM))
     assert run_apart(lambda _: signal.raise_signal(signal.SIGINT) or "done") == "done"  # type: ignore[func-returns-value]
+
+
+class Called:
+    """Is unpickled as what a function returns."""
+
+    def __init__(self, function: Callable[..., object], argument: object) -> None:
+        self._call = function, (argument,)
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object]]:
+        return self._call
+
+
+def test_a_child_that_closes_its_pipe_is_lost_at_its_time_limit() -> None:
+    with pytest.raises(ChildLost, match=r"did not return within 0\.3 s"):
+        run_apart(lambda _: os.closerange(3, 64) or sleep(20), check=TimeLimit(tuple, lambda: 0.3).check)  # type: ignore[func-returns-value]
+
+
+def test_a_child_whose_message_cannot_be_read_is_lost() -> None:
+    def work(send: Send) -> None:
+        send(Called(import_module, "only_the_child_has_this"))
+        sleep(20)
+
+    with pytest.raises(
+        ChildLost, match="sent what cannot be read: ModuleNotFoundError: No module named 'only_the_child_has_this'"
+    ):
+        run_apart(work, check=TimeLimit(tuple, lambda: 5.0).check)
+
+
+def test_a_result_that_takes_longer_to_read_than_its_child_to_end_is_returned() -> None:
+    assert run_apart(lambda _: Called(sleep, 0.4)) is None
 
 
 @pytest.mark.parametrize("how", ["exit0", "leave", "terminate", "hang"])
