@@ -253,6 +253,8 @@ class Conductor:
             for role, how in self._slots.remove_expired().items():
                 reason = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
                 self._mark_lost(role, Failure(FailureCode.ROLE_LOST, reason))
+            if self._slots.empty:
+                self._send(RunControl.HELLO)  # a replacement answers with the id of its process
             self._notify(*self._member.complaints(), *self._member.suspicions())
             self._operator_requests.poll(self._collector.collected.supervisor)
             self._watch.poll()
@@ -269,6 +271,7 @@ class Conductor:
             raise RunFailed(FailureCode.FORGED, forged, role, topics=("palpate/control",))
         if self._slots.fill(role):
             self.watchdog.restart(role)  # the time before does not count as a stall
+            self._freezes.add(role, detail)
             self._notify(f"another process replaces {role} from {when} on")
         if message.state == ServiceReport.FINISHED:
             finished.add(role)
@@ -341,6 +344,7 @@ class Conductor:
             tick = max(self.watchdog.progress[role].tick, 0) / NS
             self._notify(f"{role} left at {tick:.3f} s: {cause}; its slot is kept for {self._slots.patience_s:.0f} s")
             self._subscriptions[role].hand_over()
+            self._freezes.forget(role)
             self._send(RunControl.HANDOVER, role=role, reason=cause.text)
 
     def _mark_lost(self, role: str, cause: Failure) -> None:

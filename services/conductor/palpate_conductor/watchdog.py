@@ -111,6 +111,10 @@ class FreezeWatch:
             with suppress(psutil.Error):
                 self._activity[role] = Activity(int(detail["pid"]))
 
+    def forget(self, role: str) -> None:
+        """End the watch over the process of `role`, which another one may replace."""
+        self._activity.pop(role, None)
+
     def connection_lost(self, role: str) -> str:
         """Return a text for the closed connection of `role`, with the state of its process if that still runs."""
         activity = self._activity.get(role)

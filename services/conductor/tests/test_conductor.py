@@ -2,10 +2,11 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from time import sleep, time_ns
+from time import monotonic, sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -15,7 +16,7 @@ import zenoh
 
 from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
-from palpate_bus.messages import NS, ExamState, IndentationTruth, Point, SupervisorState, header
+from palpate_bus.messages import NS, ExamState, IndentationTruth, Point, ServiceReport, SupervisorState, header
 from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
@@ -140,6 +141,35 @@ def test_a_process_without_a_connection_is_distinguished_from_one_that_exited() 
     child.kill()
     child.wait()
     assert watch.connection_lost("planning") == exited
+
+
+def test_after_a_freeze_the_replacement_is_watched_and_the_frozen_process_is_not(session: zenoh.Session) -> None:
+    children = [subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) for _ in range(2)]
+    ready = [{"pid": child.pid, "home": pid_space()} for child in children]
+    timing = Timing(wallclock=True, handover_s=60.0)
+    conductor = Conductor(session, contract(), 0, ("control", "camera"), Collector(), Patience(frozen=0.4), timing)
+    conductor._freezes.add("camera", ready[0])
+
+    def empty_slots() -> set[str]:
+        end = monotonic() + 1.5
+        while monotonic() < end and not conductor._slots.empty:
+            conductor._lose_frozen(())
+            sleep(0.05)
+        return {*conductor._slots.empty}
+
+    try:
+        children[0].send_signal(signal.SIGSTOP)
+        assert empty_slots() == {"camera"}
+        report = ServiceReport(ServiceReport.READY, "camera", NEVER, "", "")
+        conductor._handle_report("camera", report, ready[1], set())
+        assert not empty_slots()
+        children[1].send_signal(signal.SIGSTOP)
+        assert empty_slots() == {"camera"}
+        assert not conductor.result.lost
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
 
 
 @pytest.mark.parametrize(("wallclock", "beats", "stood_still_s"), [(True, False, 0.4), (False, False, 0.0), (True, True, 0.0)])
