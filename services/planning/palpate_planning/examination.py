@@ -291,7 +291,7 @@ class ExaminationSequence:
 
     def _renumber(self, before: PerceivedAbdomen, perceived: PerceivedAbdomen) -> None:
         """Give each target of a new view the state of the nearest one before."""
-        nearest = dict(enumerate(nearest_targets(before.positions, perceived.positions)))
+        nearest = dict(enumerate(nearest_targets(before.positions, perceived.positions).tolist()))
         wanted, skipped = self._remainder.wanted, self.skipped
         if wanted is not None:
             self._remainder.wanted = frozenset(i for i, was in nearest.items() if was in wanted)

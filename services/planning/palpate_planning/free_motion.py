@@ -72,7 +72,7 @@ class BackgroundTask(Generic[T]):
 
 
 PLANNING_TIME = 200 * MS
-"""Simulated time that planning one free motion takes [ns]."""
+"""Simulated time that planning one free motion, or one press, takes [ns]."""
 AT_POSTURE_RAD = 0.01
 """The arm is at a posture if all joints are closer than this."""
 

@@ -38,7 +38,7 @@ class WallTuning(NamedTuple):
 
 
 class RecoveryTuning(NamedTuple):
-    """Limits and speeds for strokes that are taken up again."""
+    """Limits for strokes that are taken up again."""
 
     soft_stops_max: int = 3
     repeats_max: int = 3
@@ -52,8 +52,6 @@ class RecoveryTuning(NamedTuple):
     clear_height_m: float = 0.003
     """Above this height an arm that was pushed aside may move laterally."""
     on_path_m: float = 1e-6
-    return_mps: float = 0.15
-    return_acceleration_mps2: float = 0.8
 
 
 class SurgeTuning(NamedTuple):
@@ -142,7 +140,7 @@ class Displacement:
         """`gap` [m], world axes, shape (3,): measured less planned centre of the sphere; not zero."""
         length = float(np.linalg.norm(gap))
         self._direction = gap / length
-        acceleration = RECOVERY.return_acceleration_mps2
+        acceleration = MOTION.transfer_acceleration_mps2
         self._length = JerkLimitedAxis(length, acceleration, 10 * acceleration, period_s)
 
     def move(self, setpoint: Setpoint) -> Setpoint:
@@ -153,7 +151,7 @@ class Displacement:
 
     def shrink(self) -> bool:
         """Return to the path for one period; True once there."""
-        return self._length.step(0.0, RECOVERY.return_mps)
+        return self._length.step(0.0, MOTION.transfer_mps)
 
     def stay(self) -> None:
         """Stop the return."""

@@ -1,9 +1,9 @@
 """Presses that a search requests, appended to the strokes one at a time."""
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.free_motion import BackgroundTask
+from palpate_planning.free_motion import PLANNING_TIME, BackgroundTask
 from palpate_planning.palpation import Palpation
-from palpate_planning.strokes.requests import PLANNING_TIME, PressPlanner, PressRequest
+from palpate_planning.strokes.requests import PressPlanner, PressRequest
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.waits import FOR_PLAN
 

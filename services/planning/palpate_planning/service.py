@@ -12,7 +12,7 @@ from palpate_bus.messages import CameraTrigger, PalpationTargets, RobotStatus, S
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.messages.geometry import wrench
-from palpate_bus.messages.stamps import MS, header, nanoseconds
+from palpate_bus.messages.stamps import MS, NS, header, nanoseconds
 from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC
@@ -25,7 +25,6 @@ from palpate_planning.contact import SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import abdomen_of, correction_message, motion_of, path_message, state_message, touch_message
-from palpate_planning.periods import SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.status import NO_STOP, ArmStop, Observation
 from palpate_planning.strokes.plan import PerceivedAbdomen
@@ -60,7 +59,7 @@ class PlanningService(Service):
         self._X_WA = np.array(known.X_WA)
         if not lockstep:
             _lower_worker_priority()
-        step_s, frame_ns = roles["planning"].period / SECOND, roles["camera"].period
+        step_s, frame_ns = roles["planning"].period / NS, roles["camera"].period
         setpoints = contract().topics[TOPIC]
         self._exam = ExaminationSequence(known, step_s, frame_ns, setpoints.rates, before, lockstep=lockstep)
         self._max_silence = setpoints.expiry

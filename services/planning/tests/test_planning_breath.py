@@ -200,8 +200,8 @@ def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
 
 def test_targets_of_a_new_scan_are_known_by_their_places() -> None:
     before = np.array([(0.01 * k, 0.0, 0.0) for k in range(5)])
-    assert nearest_targets(before, before[::-1] + 0.02) == [4, 3, 2, 1, 0]
-    assert nearest_targets(before, np.array([(0.005 * k, 0.001 * k, 0.0) for k in range(9)]))[::2] == [0, 1, 2, 3, 4]
+    assert nearest_targets(before, before[::-1] + 0.02).tolist() == [4, 3, 2, 1, 0]
+    assert nearest_targets(before, np.array([(0.005 * k, 0.001 * k, 0.0) for k in range(9)])).tolist()[::2] == [0, 1, 2, 3, 4]
 
 
 def test_a_patient_who_moved_out_of_view_is_assessed_from_the_samples_before() -> None:

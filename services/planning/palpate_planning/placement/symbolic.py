@@ -61,8 +61,6 @@ class ArmFunctions(NamedTuple):
     """(q, base, force) -> joint torques that hold gravity and press with `force` [N m], shape (n,)."""
     dexterity: Any
     """(q, base) -> sqrt(det(J J^T)) of the length-scaled Jacobian [1]: zero where singular."""
-    pose: Any
-    """(q, base) -> rotation (3, 3) and origin (3,) [m] of the indenter frame in world."""
 
 
 def _axis_rotation(ca: Any, axis: Array | tuple[float, float, float], angle: Any) -> Any:
@@ -129,7 +127,6 @@ def arm(robot: Robot) -> ArmFunctions:
         ca.Function("cost", [q, base, force], [cost, ca.gradient(cost, q)]),
         ca.Function("torque", [q, base, force], [torque]),
         ca.Function("dexterity", [q, base], [ca.sqrt(ca.fmax(gram, 0))]),
-        ca.Function("pose", [q, base], [R, p]),
     )
 
 

@@ -147,12 +147,12 @@ class ExamPlanner:
         return chosen.q, skipped
 
 
-def nearest_targets(before: Array, targets: Array) -> list[int]:
+def nearest_targets(before: Array, targets: Array) -> Ints:
     """Return the index of the nearest target `before`, shape (k, 3), for each of `targets`, shape (n, 3), in world [m].
 
     Both about their middle, since the patient has moved. A pattern that depends on the surface may have other targets then.
     """
-    return [int(i) for i in cKDTree(before - before.mean(axis=0)).query(targets - targets.mean(axis=0))[1]]
+    return np.asarray(cKDTree(before - before.mean(axis=0)).query(targets - targets.mean(axis=0))[1])
 
 
 def look_postures(known: ExamInput, *, hidden: bool = True) -> list[Array]:

@@ -5,12 +5,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.periods import MS
 from palpate_planning.strokes.coverage import Stroke
 from palpate_planning.strokes.segments import Segment, SegmentPlanner
 
-PLANNING_TIME: Final = 200 * MS
-"""Simulated time that planning a press takes [ns]."""
 _NEAREST: Final = 4
 """Number of targets tried where the place itself cannot be pressed."""
 
