@@ -137,11 +137,11 @@ def test_a_message_is_held_against_the_contract_once() -> None:
     assert not Packet(b"", 0, 1).checked
 
 
-def status(t: int, force: float, stamp: int | None = None) -> Any:
+def status(t: int, force: float, stamp: int | None = None, cause: int = 0) -> Any:
     q = np.full(7, 1e-9 * t)
     fields = {"wrench": Wrench(Vector3(force, 0.0, 0.0), Vector3(1e-9 * t, 0.0, 0.0)), "position": q, "velocity": q}
     message = blank("palpation_msgs/msg/RobotStatus", t if stamp is None else stamp)
-    return replace(message, mode=1, applied_torque=q, measured_torque=q, **fields)
+    return replace(message, mode=1, cause=cause, applied_torque=q, measured_torque=q, **fields)
 
 
 def test_a_frozen_value_is_refused_until_it_changes() -> None:
@@ -151,6 +151,17 @@ def test_a_frozen_value_is_refused_until_it_changes() -> None:
     with pytest.raises(RefusedMessage, match="7 messages in a row"):
         check(status(70 * MS, 5.0), 70 * MS)
     check(status(80 * MS, 5.1), 80 * MS)
+    for t in range(90 * MS, 200 * MS, 10 * MS):  # a driver that names a cause may have no newer measurement
+        check(status(t, 5.1, cause=9), t)
+    check(status(200 * MS, 90.0), 200 * MS)
+
+
+def test_joint_states_of_no_joints_are_not_compared() -> None:
+    check, none = PortCheck(RULES.topics["joint_states"]), np.zeros(0)
+    for t, q in ((0, np.full(7, 1.0)), *((k * MS, none) for k in range(1, 100)), (100 * MS, np.full(7, 1.5))):
+        check(msg.JointState(header(t), [], q, q, q), t)
+    with pytest.raises(RefusedMessage, match=r"position = 1\.6 after 1\.5"):
+        check(msg.JointState(header(101 * MS), [], *(np.full(7, 1.6),) * 3), 101 * MS)
 
 
 def refusal(text: str) -> Any:

@@ -106,15 +106,16 @@ def check_order(topic: Topic, past: PastMessages, message: Message, t: int) -> I
         yield MessageViolation(ViolationKind.AGE, "header.stamp", f"at most {age:g} ms old", got)
     if stamp - t > AHEAD_NS:
         yield MessageViolation(ViolationKind.STAMP, "header.stamp", f"at most {AHEAD_NS / 1e6:g} ms ahead", got)
-    compared = all(getattr(message, field) == value for field, value in topic.compared_while.items())
-    for path, rate in topic.rates.items() if past.message is not None and compared else ():
+    before, conditions = past.message, topic.compared_while.items()
+    compared = before is not None and all(getattr(one, key) == value for key, value in conditions for one in (message, before))
+    for path, rate in topic.rates.items() if compared else ():
         max_change = rate * (stamp - past.stamp) / 1e9
-        if text := _too_fast(message, past.message, path, max_change):
+        if text := _too_fast(message, before, path, max_change):
             allowed = f"a change of {rate:g} {topic.units.get(path, 'rad')} per second"
             got = f"{text}, {(stamp - past.stamp) / 1e6:g} ms apart"
             yield MessageViolation(ViolationKind.CHANGE, path, allowed, got)
     for count, (path, limit) in zip(past.repeats, topic.varies.items(), strict=True):
-        if count >= limit and repeats(message, past.message, path):
+        if count >= limit and repeats(message, before, path):
             values = numbers(message, path)
             text = f"{values.tolist() if values.size <= SHOWN else 'the same values'} in {count + 2} messages in a row"
             yield MessageViolation(ViolationKind.FROZEN, path, f"at most {limit + 1} equal ones: a live sensor has noise", text)
@@ -126,8 +127,10 @@ def _too_fast(message: Message, before: Message, path: str, max_change: float) -
         turned = turn(attrgetter(path)(message), attrgetter(path)(before))
         return "" if turned <= max_change else f"{turned:g} rad from the one before"
     now, then = numbers(message, path), numbers(before, path)
-    worst = int(np.argmax(np.abs(now - then))) if now.size else 0
-    return "" if not now.size or abs(now[worst] - then[worst]) <= max_change else f"{now[worst]:g} after {then[worst]:g}"
+    if not now.size or not then.size:
+        return ""
+    worst = int(np.argmax(np.abs(now - then)))
+    return "" if abs(now[worst] - then[worst]) <= max_change else f"{now[worst]:g} after {then[worst]:g}"
 
 
 FEW = 32
@@ -249,6 +252,11 @@ def _out_of_range(path: str, values: np.ndarray[Any, Any], low: float, high: flo
     return MessageViolation(ViolationKind.RANGE, path, allowed, f"{wrong[0]:g}")
 
 
+def _none(path: str) -> str:
+    """Return the source of a test for an array that has no numbers, as those of what an arm does not measure."""
+    return f"not m.{path}.size or not before.{path}.size"
+
+
 @cache
 def compile_check(row: str, sends: bool, alone: bool = False) -> Callable[[Message, PastMessages, int], bool]:
     """Return a function that is True for a message that conforms to its topic, a row as JSON, and keeps it for comparison.
@@ -298,7 +306,7 @@ class _Source:
             yield f"if stamp != t and (stamp > t + {AHEAD_NS} or {old}): return False"
         lines = [*self._rates(), *self._varies()]
         if lines:
-            same = "".join(f" and m.{field} == {value!r}" for field, value in topic.compared_while.items())
+            same = "".join(f" and m.{field} == before.{field} == {value!r}" for field, value in topic.compared_while.items())
             yield from ("before = past.message", f"if before is not None{same}:", *(f" {line}" for line in lines))
             if same:
                 yield from ("else:", f" past.repeats = {[0] * len(topic.varies)}")
@@ -314,7 +322,8 @@ class _Source:
                 continue
             for leaf in leaves(self._topic.type, path):
                 if leaf.array:
-                    yield f"if not dist(m.{leaf.path}.tolist(), before.{leaf.path}.tolist()) <= max_change:"
+                    yield f"if {_none(leaf.path)}: pass"
+                    yield f"elif not dist(m.{leaf.path}.tolist(), before.{leaf.path}.tolist()) <= max_change:"
                     yield f" for one in (m.{leaf.path} - before.{leaf.path}).tolist():"
                     yield "  if not -max_change <= one <= max_change: return False"
                 else:
@@ -326,7 +335,7 @@ class _Source:
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
-            none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
+            none = f"{_none(leaf.path)} or " if leaf.array else ""
             yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
             yield f"elif past.repeats[{k}] < {limit}: past.repeats[{k}] += 1"
             yield "else: return False"

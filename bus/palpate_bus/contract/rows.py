@@ -103,7 +103,7 @@ class Topic(_Row):
     varies: dict[str, int] = {}
     """Number of messages in a row whose field may repeat exactly."""
     compared_while: dict[str, int | str] = {}
-    """Values of other fields without which a message is not compared with the one before by `rates` and `varies`."""
+    """Values of other fields that two messages in a row have if `rates` and `varies` compare them."""
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0

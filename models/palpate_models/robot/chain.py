@@ -76,6 +76,8 @@ class Arm:
     """Postures from which inverse kinematics starts, with the first joint at zero. `fitting.seeds_of` seeks missing ones."""
     R_BL: Array | None = None
     """Axes of the links at zero in the arm's base, shape (3, 3); None if they are those of the base."""
+    R_FU: Array | None = None
+    """Axes of the flange's link in the URDF, in those of the flange, shape (3, 3); None if they are the same."""
 
     @property
     def joints(self) -> int:

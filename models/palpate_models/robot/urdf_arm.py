@@ -176,7 +176,8 @@ class _Reader(UrdfTree):
         if wrong := [f"{field}: expected {n} values, one per joint, not {len(q)}" for field, q in lists if len(q) != n]:
             return None, [*self.faults, *wrong]
         lower, upper, velocity, torque = self._limits(moving)
-        R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", given.flange_rpy_rad).as_matrix()
+        R_UF = Rotation.from_euler("xyz", given.flange_rpy_rad).as_matrix()
+        R_BF = poses[-1][:3, :3] @ R_UF
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
         frames = [np.eye(4), *(poses[chain.index(link_name(joint, "child"))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
@@ -212,6 +213,7 @@ class _Reader(UrdfTree):
             capsules=capsules,
             seeds_rad=given.seeds_rad,
             R_BL=R_BF,
+            R_FU=R_UF.T,
         )
         return (None, self.faults) if self.faults else _at_home(arm, given)
 

@@ -185,7 +185,7 @@ class ControlService(Service):
         late = t - self._began > self._setpoint_expiry
         problem = Problem(missing, f"{missing}: none yet") if late else NO_PROBLEM
         if self._admittance is not None and self._last is self._still:
-            if joints is None:
+            if joints is None or joints.name != self._names:
                 return self._command(t, self._still, self._no_validity, problem)
             self._last = np.array(joints.position)
         return self._command(t, self._last, self._full_validity, problem)

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lbr_bench import MS, SCENARIO, Rig, active_rig
+from lbr_bench import MS, SCENARIO, Rig, active_rig, driver_on_emulator
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, header, nanoseconds
+from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
 from palpate_robot.backends.hardware import GravityModel
@@ -33,13 +34,18 @@ def test_until_the_session_commands_the_driver_waits_and_says_for_what() -> None
 def test_what_the_driver_sends_keeps_the_contract() -> None:
     rig = Rig()
     checks = {topic.name: PortCheck(topic, sends=True) for topic in contract().outputs("robot")}
-    sent = set()
-    for _ in range(700):
-        rig.tick(1)
-        for name, message in rig.outbox.items():
-            checks[name](message, rig.t)
-        sent |= rig.outbox.keys()
+    sent, reasons = set(), []
+    for silent, ticks in ((True, 600), (False, 150), (True, 150)):
+        rig.port.silent = silent
+        for _ in range(ticks):
+            rig.tick(1)
+            for name, message in rig.outbox.items():
+                checks[name](message, rig.t)
+            sent |= rig.outbox.keys()
+        reasons.append(rig.status.reason)
     assert sent >= {"joint_states", "robot/status", "sim/tool_state", "sim/link_poses"}
+    assert reasons[:2] == ["no LBRState received yet", ""]
+    assert "no LBRState for 2" in reasons[2]
 
 
 def test_positive_torque_turns_a_joint_the_positive_way_and_its_velocity_hardly_lags(rig: Rig) -> None:
@@ -67,16 +73,21 @@ def hold_cause(rig: Rig) -> tuple[int, str]:
     return rig.status.cause, rig.status.reason
 
 
-def test_silent_arm_holds_and_nothing_is_pushed_on(rig: Rig) -> None:
+@pytest.mark.parametrize("idle", [False, True])
+def test_a_silent_arm_is_reported_and_nothing_is_pushed_on(rig: Rig, idle: bool) -> None:
+    if idle:
+        rig.commanding = False
+        rig.tick(100)
+        rig.driver._driver.release(rig.t)
+        rig.plant.reset(rig.plant.q, np.array([0.5, 0, 0, 0, 0, 0, 0]))
     rig.target = rig.target + 0.1
-    rig.tick(50)
+    rig.tick(10 if idle else 50)
     assert np.abs(rig.port.torques[-1]).max() > 1
-    rig.port.silent, silent_since = True, rig.t
+    rig.port.silent = True
     rig.tick(60)
-    assert hold_cause(rig)[0] == RobotStatus.CAUSE_DEVICE
+    assert rig.status.mode == (RobotStatus.MODE_IDLE if idle else RobotStatus.MODE_SAFE_HOLD)
+    assert rig.status.cause == RobotStatus.CAUSE_DEVICE
     assert not rig.port.torques[-1].any()
-    assert "joint_states" not in rig.outbox
-    assert nanoseconds(rig.status.header.stamp) <= silent_since, "what was measured then is not measured now"
 
 
 def test_a_state_that_fri_does_not_have_holds(rig: Rig) -> None:
@@ -90,6 +101,20 @@ def test_silent_sensor_holds(rig: Rig) -> None:
     rig.port.ft_silent = True
     rig.tick(80)
     assert "no F/T reading" in hold_cause(rig)[1]
+
+
+def test_without_a_sensor_the_driver_waits_and_reports_it() -> None:
+    rig = Rig()
+    rig.port.ft_silent = True
+    rig.tick(600)
+    assert (rig.status.mode, rig.status.cause) == (RobotStatus.MODE_IDLE, RobotStatus.CAUSE_DEVICE)
+    assert rig.status.reason == "no F/T reading"
+
+
+def test_the_weight_of_the_tool_is_added_to_a_wrench_without_it() -> None:
+    scenario = load_scenario("clean", ["robot.driver.ft_weight=false"])
+    driver, _ = driver_on_emulator(scenario)
+    assert np.linalg.norm(driver._wrench_on_sensor(np.zeros(6))[:3]) == pytest.approx(GRAVITY * scenario.robot.tool_mass_kg)
 
 
 def test_a_session_that_ends_holds(rig: Rig) -> None:
@@ -194,7 +219,7 @@ def stamps(rig: Rig, ticks: int, topic: str) -> list[int]:
     found = []
     for _ in range(ticks):
         rig.tick(1)
-        if topic in rig.outbox:
+        if topic in rig.outbox and getattr(rig.outbox[topic], "name", True):
             found.append((rig.t - nanoseconds(rig.outbox[topic].header.stamp)) // MS)
     return found
 
@@ -210,4 +235,4 @@ def test_what_a_silent_arm_measured_grows_old_and_ceases(topic: str, silent: str
     rig = Rig()
     rig.tick(101)
     setattr(rig.port, silent, True)
-    assert stamps(rig, 70, topic) == list(range(1, 21)), "a reader sees how old they are, until they are none"
+    assert stamps(rig, 70, topic) == list(range(1, 21)), "a reader sees how old they are, until they are of no joints, or none"

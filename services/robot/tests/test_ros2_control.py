@@ -1,18 +1,27 @@
 """The driver of ros2_control on the emulator of each profile, in simulated time."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_message, header
+from palpate_bus.contract import contract
+from palpate_bus.contract.port_check import PortCheck
+from palpate_bus.messages import JointState, JointTorqueCommand, RobotStatus, WrenchStamped, duration_message, header
 from palpate_bus.messages.codes import DriverMode, HoldCause
+from palpate_bus.messages.geometry import wrench_message
 from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
+from palpate_models.robot.arm import arm_of
+from palpate_models.robot.chain import Arm
 from palpate_models.robot.urdf_arm import load_arm
-from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.arm_file import arm_path
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_robot.backends.ros2_control.port import Ros2Port, StackStatus
+from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules
-from palpate_robot.backends.ros2_control.service import FirstContactCheck, create
+from palpate_robot.backends.ros2_control.service import FirstContactCheck, Ros2ControlService, create
 
 MS = 1_000_000
 WALL_NPM = 2000.0
@@ -31,6 +40,7 @@ class Ros2Bench:
         self.emulator = self.driver._port.emulator
         self.speed_radps, self.torque_nmps, self.press = 0.0, 0.0, False
         self.peak_n, self.states = 0.0, 0
+        self._checks = {topic.name: PortCheck(topic, sends=True) for topic in contract().outputs("robot")}
         self._start: Any = None
         self._wall_m = self._height_m()
 
@@ -44,6 +54,9 @@ class Ros2Bench:
             self.peak_n = max(self.peak_n, self.emulator.force_W[2])
             outbox = self.driver.step(self.t, self.inbox)
             self.status = outbox.get("robot/status", self.status)
+            assert {"joint_states", "ft/wrench", "sim/tool_state"} <= outbox.keys(), "lockstep needs them on every tick"
+            for name, message in outbox.items():
+                self._checks[name](message, self.t)
             self.states = self.driver._states
             if self._start is None and "joint_states" in outbox:
                 self._start, self._begun = outbox["joint_states"].position.copy(), self.t
@@ -128,6 +141,107 @@ def test_a_reflex_lasts_until_recovered_and_the_driver_holds_until_released() ->
     bench.driver._driver.release(bench.t)
     bench.tick(50)
     assert bench.driver._driver.mode is DriverMode.ACTIVE
+
+
+class HandPort(Ros2Port):
+    """An arm that is where it is put."""
+
+    def __init__(self, arm: Arm) -> None:
+        self.names, self.q, self.running, self.t = list(arm.joint_names), arm.home_rad.copy(), True, 0
+        self.sent: list[Any] = []
+        self.poses: list[Any] = []
+
+    def states(self) -> list[Any]:
+        self.t += MS
+        return [JointState(header(self.t), self.names, self.q, 0.01 + 0 * self.q, 0 * self.q)]
+
+    def wrenches(self) -> list[Any]:
+        return [WrenchStamped(header(self.t), wrench_message(np.zeros(6)))]
+
+    def command(self, q: Any, values: Any) -> None:
+        self.sent.append(np.array(values))
+
+    def pose(self, X_BU: Any) -> None:
+        self.poses.append(X_BU)
+
+    def status(self) -> StackStatus:
+        return StackStatus(1.0, self.running)
+
+
+def by_hand(arm: str, profile: str, *changes: str) -> tuple[Ros2ControlService, HandPort]:
+    exam = exam_input(load_scenario("clean", [f"robot.arm={arm}", f"robot.driver.profile={profile}", *changes]))
+    port = HandPort(arm_of(exam.robot))
+    return Ros2ControlService(exam, port, profile_of(exam.robot)), port
+
+
+def test_a_hold_of_an_arm_that_takes_positions_does_not_go_back() -> None:
+    bench = Ros2Bench("ur5", "ur")
+    bench.speed_radps = 0.5
+    bench.tick(400)
+    bench.driver._driver.hold(bench.t, HoldCause.STOP_REQUESTED, "stop")
+    sent, q = [bench.emulator.command[0]], []
+    for _ in range(250):
+        bench.tick(1)
+        sent.append(bench.emulator.command[0])
+        q.append(bench.emulator._plant.q[0])
+    assert np.diff(sent).min() > -1e-9
+    assert np.diff(sent)[-1] == pytest.approx(0.0, abs=1e-9)
+    assert max(q) - q[-1] < 1e-3
+
+
+def test_the_emulated_position_loop_takes_each_command_once() -> None:
+    bench, speeds = Ros2Bench("ur5", "ur"), []
+    bench.speed_radps = 0.3
+    bench.tick(400)
+    for _ in range(50):
+        bench.tick(1)
+        speeds.append(bench.emulator._loop._rd[0])
+    assert speeds == pytest.approx([0.3] * 50, abs=1e-3), "one that is taken twice stands every other millisecond"
+
+
+def test_an_arm_that_was_moved_by_hand_stays_where_it_was_put() -> None:
+    driver, port = by_hand("ur5", "ur")
+    inbox, t = HandInbox(), 0
+
+    def tick(ticks: int = 30, target: Any = None) -> DriverMode:
+        nonlocal t
+        for _ in range(ticks):
+            t += MS
+            if target is not None:
+                command = JointTorqueCommand(header(t), np.zeros(0), target, duration_message(50 * MS), "", "")
+                inbox.messages["control/joint_torque"] = command
+            driver.step(t, inbox)
+        return driver._driver.mode
+
+    assert tick(target=port.q) is DriverMode.ACTIVE
+    port.running = False
+    tick()
+    port.q = port.q + 0.3
+    assert tick() is DriverMode.SAFE_HOLD
+    assert port.sent[-1] == pytest.approx(port.q)
+    port.running = True
+    tick()
+    assert port.sent[-1] == pytest.approx(port.q, abs=1e-3)
+    driver._driver.release(t)
+    assert tick() is DriverMode.IDLE
+    port.q = port.q + 0.3
+    driver._driver.hold(t, HoldCause.STOP_REQUESTED, "stop")
+    tick()
+    assert port.sent[-1] == pytest.approx(port.q, abs=1e-3)
+
+
+def test_a_cartesian_controller_is_sent_poses_only_and_those_of_its_own_flange(tmp_path: Path) -> None:
+    turned = tmp_path / "turned.yaml"
+    turned.write_text(arm_path("panda").read_text() + "\nflange_rpy_rad: [0.0, 0.0, 0.7854]\n")
+    poses = []
+    for arm in ("panda", str(turned)):
+        driver, port = by_hand(arm, "franka", "robot.level=setpoint")
+        for k in range(5):
+            driver.step(k * MS, HandInbox())
+        driver.finish()
+        assert not port.sent, "its topic takes no torques"
+        poses.append(port.poses[-1])
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-6)
 
 
 def still(joints: int, force_n: float = 0.0, speed_radps: float = 0.0) -> Sensed:

@@ -15,16 +15,17 @@ import pinocchio as pin
 
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, Message, RobotStatus, String, WrenchStamped, header
+from palpate_bus.messages import NS, JointState, Message, RobotStatus, String, WrenchStamped, header
 from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.messages.geometry import wrench, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import arm_of, urdf
+from palpate_models.robot.arm import TOOL, arm_of, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_robot.backends.arm_port import ArmPort
 from palpate_robot.driver import Command, Driver
+from palpate_robot.position_loop import TUNING as LOOP
 from palpate_robot.stop_requests import ReceivedCommands, StopRequests
 
 JOINTS: Final = "joint_states"
@@ -33,6 +34,8 @@ STATE_AGE_NS: Final = contract().topics[JOINTS].max_age
 FT_AGE_NS: Final = contract().topics["ft/wrench"].max_age
 STATUS_PERIOD: Final = contract().topics["robot/status"].period
 LINKS_PERIOD: Final = contract().topics["sim/link_poses"].period
+NEVER_NS: Final = -NS
+"""Time before the first tick."""
 TAKE_OVER_NS: Final = 100_000_000
 """Time after the first command in which commands of others are tolerated: the watchdog sends until it sees the new driver."""
 
@@ -62,6 +65,12 @@ class MeasuredArm(ABC):
     @abstractmethod
     def fault(self, t: int) -> str | None:
         """Return None if the arm accepts commands at `t` [ns], else a message that says why not."""
+
+
+def tool_load(mass_kg: float, up_S: Array) -> Array:
+    """Return the wrench of a tool's weight on the F/T sensor, in its axes, shape (6,), with the mass half-way to the indenter."""
+    force = -mass_kg * GRAVITY * up_S
+    return np.concatenate((force, np.cross((0.0, 0.0, TOOL.ft_to_indenter_m / 2), force)))
 
 
 class CarriedLoad(NamedTuple):
@@ -147,6 +156,7 @@ class HardwareService(Service):
         damping: Array,
         *,
         ft_sign: int,
+        ft_weight: bool,
         inner: InnerLoop | None = None,
     ) -> None:
         """Create the driver of an arm.
@@ -157,6 +167,7 @@ class HardwareService(Service):
             measured: joint state from its messages.
             damping: largest joint damping in a hold [N m s/rad], shape (n,); it acts some cycles late on a measured speed.
             ft_sign: -1 if the sensor reports the wrench of the sensor on the tool.
+            ft_weight: True if its wrench includes the tool's weight.
             inner: follows set-points in this process; without it `control/joint_torque` is applied.
         """
         arm, given = arm_of(exam.robot), exam.robot.driver
@@ -173,7 +184,7 @@ class HardwareService(Service):
         self._emulated = given.emulated
         yaw = np.deg2rad(given.ft_yaw_deg)
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        self._R_ST = ft_sign * turn
+        self._R_ST, self._ft_weight = ft_sign * turn, ft_weight
         self._commanding_since: int | None = None
         self._wrench = np.zeros(6)
         self._wrench_at: int | None = None
@@ -181,8 +192,11 @@ class HardwareService(Service):
         self._links: Message | None = None
         self._force, self._external_S = 0.0, np.zeros(3)
         self._applied = np.zeros(n)
-        self._stopped: Array | None = None
-        """Positions at which an arm that takes positions stopped in a hold [rad]."""
+        self._limits, self._braking = (arm.lower_rad, arm.upper_rad), LOOP.acceleration_factor * arm.acceleration_radps2
+        self._sent, self._sent_v, self._sent_at = np.zeros(n), np.zeros(n), NEVER_NS
+        """Newest command of positions [rad], its speed [rad/s] and its time [ns]."""
+        self._fault: str | None = None
+        """Why arm or F/T sensor do not allow commands."""
         self._sums, self._summed = np.zeros(6 + 2 * n + len(measured.torque)), 0
         self._means = self._sums
         self._states = self._commands = 0
@@ -200,18 +214,20 @@ class HardwareService(Service):
         self._stop_requests.apply(t, inbox)
         if self._inner is not None:
             self._inner.collect(inbox)
-        if self._arm.received is not None and t - self._arm.received <= STATE_AGE_NS:
+        self._check_connection(t)
+        if self._arm.received is not None:
             joints = JointState(header(self._arm.received), self._names, self._arm.q, self._arm.v, self._applied.copy())
-            outbox[JOINTS] = joints  # on every tick: between two states the newest, with its stamp
             if self._wrench_at is not None and t - self._wrench_at <= FT_AGE_NS:
                 outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), wrench_message(self._wrench))
             if fresh:
                 self._drive(t, inbox, joints)
-        if self._arm.received is not None:
-            self._check_connection(t)
-            # Damping of an old speed would be a constant push. Zero torque is sent once; then the watchdog takes over.
-            if self._driver.held and t - self._arm.received > STATE_AGE_NS and self._applied.any():
-                self._relax()
+            elif t - self._arm.received > STATE_AGE_NS:
+                none = np.zeros(0)  # lockstep needs a message on every tick
+                joints = JointState(header(t), [], none, none, none)
+                # Damping of an old speed would be a constant push. Zero torque is sent once; then the watchdog takes over.
+                if self._applied.any():
+                    self._relax()
+            outbox[JOINTS] = joints  # on every tick: between two states the newest, with its stamp
         if not t % STATUS_PERIOD:
             outbox["robot/status"] = self._status(t)
         if self._emulated:
@@ -220,9 +236,11 @@ class HardwareService(Service):
 
     def finish(self) -> Mapping[str, Any]:
         """Leave the arm without torque. Return safe holds, counts, and the largest force and torques."""
-        if self._arm.received is not None and not self._positions:
-            self._relax()
-        self._port.close()
+        try:
+            if self._arm.received is not None and not self._positions:
+                self._relax()
+        finally:
+            self._port.close()
         return {
             **self._driver.facts(),
             "peak_external_force_N": self._peak_force,
@@ -258,16 +276,19 @@ class HardwareService(Service):
 
     def _wrench_on_sensor(self, reading: Array) -> Array:
         """Return the wrench of tool and environment on the sensor in its axes, shape (6,)."""
-        return np.concatenate((self._R_ST @ reading[:3], self._R_ST @ reading[3:]))
+        wrench_S = np.concatenate((self._R_ST @ reading[:3], self._R_ST @ reading[3:]))
+        if self._ft_weight:
+            return wrench_S
+        return np.asarray(wrench_S + tool_load(self._robot.tool_mass_kg, self._model.at(self._arm.q).up_S))
 
-    def _check_connection(self, t: int) -> bool:
-        """Return True if the arm accepts commands and the F/T sensor is alive; else an active driver holds."""
+    def _check_connection(self, t: int) -> None:
+        """Find what the arm and the F/T sensor lack for commands; an active driver then holds."""
         fault = self._arm.fault(t)
         if fault is None and (self._wrench_at is None or t - self._wrench_at > FT_AGE_NS):
             fault = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
         if fault is not None and self._driver.mode is DriverMode.ACTIVE:
             self._driver.hold(t, HoldCause.DEVICE, fault)
-        return fault is None
+        self._fault = fault
 
     def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
         """Answer a new state with a command."""
@@ -277,22 +298,38 @@ class HardwareService(Service):
         self._external_S = self._wrench[:3] + weight * load.up_S
         self._force = float(np.linalg.norm(self._external_S))
         self._peak_force = max(self._peak_force, self._force)
-        command = self._command(t, inbox, joints) if self._check_connection(t) else None
+        command = self._command(t, inbox, joints) if self._fault is None else None
         lost = inbox.lost("control") and self._inner is None
         values = self._driver.update(t, arm.q, arm.v, load.gravity, self._force, command, lost=lost)
         active = self._driver.mode is DriverMode.ACTIVE
-        if active:
-            self._stopped = None
-        elif self._positions:
-            if not self._driver.held:
+        if self._positions:
+            if not active and not self._driver.held:
                 return
-            self._stopped = values = arm.q if self._stopped is None else self._stopped  # stops, and stays
+            values = self._moved(t, values if active else None)
         else:
-            values = -np.minimum(self._driver.damping(arm.v, load.gravity), self._damping) * arm.v
-        if not self._positions:
+            if not active:
+                values = -np.minimum(self._driver.damping(arm.v, load.gravity), self._damping) * arm.v
             self._applied = np.asarray(values, dtype=float)
             np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
         self._send(t, values, load, active=active)
+
+    def _moved(self, t: int, values: Array | None) -> Array:
+        """Return the positions to send at `t` [ns]: `values`, or where the arm stops from the last ones, and stays [rad].
+
+        An arm that takes no commands, or had none of late, may have been moved by hand: it stays where it is.
+        """
+        arm, elapsed_s = self._arm, (t - self._sent_at) / NS
+        if values is not None:
+            speed = (values - self._sent) / elapsed_s
+            self._sent_v = np.clip(speed, np.minimum(arm.v, 0.0), np.maximum(arm.v, 0.0))  # a leap of one is not a speed
+        elif not arm.accepts or t - self._sent_at > STATE_AGE_NS:
+            values, self._sent_v = arm.q, np.zeros_like(arm.q)
+        else:
+            slower = elapsed_s * self._braking
+            self._sent_v = self._sent_v - np.clip(self._sent_v, -slower, slower)
+            values = np.clip(self._sent + elapsed_s * self._sent_v, *self._limits)
+        self._sent, self._sent_at = values, t
+        return values
 
     def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
         """Send torques [N m] or positions [rad] at `t` [ns]; `active` if they are control's."""
@@ -305,18 +342,16 @@ class HardwareService(Service):
         return self._received.newest(message)
 
     def _status(self, t: int) -> Message:
-        driver, measured, n = self._driver, t, len(self._names)
+        driver, n = self._driver, len(self._names)
         if self._summed:
             self._means = self._sums / self._summed
             self._sums, self._summed = np.zeros_like(self._sums), 0
-        elif self._arm.received is not None:
-            measured = self._arm.received  # no new measurement
         q, v, wrench, torque = np.split(self._means, (n, 2 * n, 2 * n + 6))
-        cause, reason, fault = driver.cause, driver.reason, self._arm.fault(t)
-        if not driver.held and fault is not None:
-            cause, reason = HoldCause.DEVICE, fault
+        cause, reason = driver.cause, driver.reason
+        if not driver.held and self._fault is not None:
+            cause, reason = HoldCause.DEVICE, self._fault
         return RobotStatus(
-            header(measured), int(driver.mode), int(cause), reason, q, v, wrench_message(wrench),
+            header(t), int(driver.mode), int(cause), reason, q, v, wrench_message(wrench),
             self._applied.copy(), driver.rejected, driver.culprit, torque,
         )  # fmt: skip
 

@@ -20,7 +20,9 @@ arm's viscous friction (10) it is stable with any delay; joints with enough iner
 
 def lbr_service(exam: ExamInput, port: ArmPort, inner: InnerLoop | None = None) -> HardwareService:
     """Return the driver on a port; `inner` follows set-points in its process."""
-    return HardwareService(exam, port, MeasuredLbr(), DAMPING, ft_sign=exam.robot.driver.ft_sign or 1, inner=inner)
+    given = exam.robot.driver
+    sign, weight = given.ft_sign or 1, given.ft_weight is not False
+    return HardwareService(exam, port, MeasuredLbr(), DAMPING, ft_sign=sign, ft_weight=weight, inner=inner)
 
 
 def create(scenario: Scenario) -> HardwareService:

@@ -10,6 +10,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,8 @@ from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import EmulatedArm, serve
-from palpate_robot.backends.hardware import GravityModel
-from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, Ros2Port, StackStatus, tool_load
+from palpate_robot.backends.hardware import GravityModel, tool_load
+from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, Ros2Port, StackStatus
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 from palpate_robot.backends.ros2_control.rules import RULES, Sensed
 from palpate_robot.position_loop import PositionLoop
@@ -69,10 +70,12 @@ class Ros2Emulator(EmulatedArm):
             log.error("the arm stops: %s", self.rules.stopped or "recovered")
             self.command = None
 
+        ages = count(0, MS)
+
         def drive() -> tuple[Array, Array]:
             gravity = plant.gravity_torque()
             if loop is not None:
-                return gravity + loop.torque(values, self._joints.q, self._joints.v, gravity), loop.damping
+                return gravity + loop.torque(values, self._joints.q, self._joints.v, gravity, next(ages)), loop.damping
             return self.brake() if values is None else (gravity + values, np.zeros(self.joints))
 
         self.advance(drive)

@@ -28,6 +28,11 @@ class MeasuredJoints(MeasuredArm):
         self._status = StackStatus(1.0, running=True)
         self._fault: str | None = "no joint states received yet"
 
+    @property
+    def accepts(self) -> bool:
+        """False also while the external control program does not run."""
+        return super().accepts and bool(self._status.running)
+
     def report(self, status: StackStatus) -> None:
         """Take what is new in the status of the stack."""
         speed, running = self._status

@@ -2,13 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from palpate_bus.messages import codec, header
 from palpate_bus.messages.geometry import pose_message
 from palpate_errors import UserError
-from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import TOOL, arm_of
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.arm_port import ArmPort, ZenohArmPort
@@ -29,12 +27,6 @@ class StackStatus(NamedTuple):
     """False while the arm takes no commands."""
 
 
-def tool_load(mass_kg: float, up_S: Array) -> Array:
-    """Return the wrench of a tool's weight on the F/T sensor, in its axes, shape (6,), with the mass half-way to the indenter."""
-    force = -mass_kg * GRAVITY * up_S
-    return np.concatenate((force, np.cross((0.0, 0.0, TOOL.ft_to_indenter_m / 2), force)))
-
-
 class Ros2Port(ArmPort):
     """A port that also gives the status of the stack, and takes poses."""
 
@@ -42,8 +34,8 @@ class Ros2Port(ArmPort):
         """Return what is new since the last call."""
         return StackStatus()
 
-    def pose(self, X_BF: Array) -> None:
-        """Send the desired pose of the flange in the arm's base, shape (4, 4), to a Cartesian controller of the stack.
+    def pose(self, X_BU: Array) -> None:
+        """Send the desired pose of the URDF's flange in the arm's base, shape (4, 4), to a Cartesian controller of the stack.
 
         Raises UserError where the stack has none.
         """
@@ -73,9 +65,9 @@ class ZenohRos2Port(ZenohArmPort, Ros2Port):
         """Send torques or positions, in the order of the arm's joints."""
         self._command.publish(array_message(values))
 
-    def pose(self, X_BF: Array) -> None:
+    def pose(self, X_BU: Array) -> None:
         """See `Ros2Port.pose`."""
-        pose = pose_message(X_BF[:3, :3], X_BF[:3, 3])
+        pose = pose_message(X_BU[:3, :3], X_BU[:3, 3])
         self._command.publish(codec.message_type(POSE)(header(0, self._base), pose))
 
     def status(self) -> StackStatus:

@@ -20,9 +20,9 @@ from palpate_models.robot.arm import TOOL, arm_of, base_pose, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
+from palpate_robot.backends.hardware import NEVER_NS, SETPOINT, CarriedLoad, HardwareService
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port, tool_load
+from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 
 
@@ -121,7 +121,8 @@ class Ros2ControlService(HardwareService):
         """Drive the arm of `exam` on a port."""
         arm = arm_of(exam.robot)
         measured = MeasuredJoints(arm, effort_is_torque=profile.effort_is_torque)
-        super().__init__(exam, port, measured, DAMPING_SHARE * arm.hold_damping_nms, ft_sign=profile.ft_sign)
+        damping = DAMPING_SHARE * arm.hold_damping_nms
+        super().__init__(exam, port, measured, damping, ft_sign=profile.ft_sign, ft_weight=profile.ft_weight)
         self._profile, self._level = profile, exam.robot.level
         self._followed, self._first = FollowCheck(_TOLERANCE[self._level]), FirstContactCheck()
         self._setpoint: Any | None = None
@@ -129,6 +130,8 @@ class Ros2ControlService(HardwareService):
         if arm.R_BL is not None:
             turned[:3, :3] = turned[:3, :3] @ arm.R_BL.T
         self._X_BW = np.linalg.inv(turned)
+        R_FU = np.eye(3) if arm.R_FU is None else arm.R_FU
+        self._X_IU = rigid(R_FU, (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Run one tick, with the status of the stack."""
@@ -140,24 +143,23 @@ class Ros2ControlService(HardwareService):
         """Return what the base returns, and if the first contact was checked."""
         return {**super().finish(), "first_contact_checked": self._first.passed}
 
-    def _wrench_on_sensor(self, reading: Array) -> Array:
-        wrench = super()._wrench_on_sensor(reading)
-        if self._profile.ft_weight:
-            return wrench
-        return wrench + tool_load(self._robot.tool_mass_kg, self._model.at(self._arm.q).up_S)
+    def _relax(self) -> None:
+        """Send zero torque; the springs of a Cartesian controller are relaxed already: its target follows the tool in a hold."""
+        if self._level is not CommandLevel.SETPOINT:
+            super()._relax()
 
     def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
         if not active:
             self._followed.reset()
         elif fault := self._check_response(t, values, load):
             self._driver.hold(t, HoldCause.DEVICE, fault)
+            self._sent_at = NEVER_NS  # the arm is not where it was sent
             return  # the next state is answered by the hold
         if self._level is CommandLevel.SETPOINT:
             X_WI = tool_pose(self._arm.q, self._robot)
             if active and self._setpoint is not None:
                 X_WI = pose_matrix(self._setpoint.pose)
-            X_IF = rigid(np.eye(3), (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
-            self._port.pose(self._X_BW @ X_WI @ X_IF)
+            self._port.pose(self._X_BW @ X_WI @ self._X_IU)
             self._commands += 1
         else:
             super()._send(t, values, load, active=active)
