@@ -109,7 +109,7 @@ class Rig:
         for _ in range(ticks):
             self.t += MS
             joints = self.outbox.get("joint_states")
-            if joints is not None and self.commanding:
+            if joints is not None and joints.name and self.commanding:
                 error = self.target - joints.position
                 torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
                 self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it

@@ -196,7 +196,7 @@ class HardwareService(Service):
         self._sent, self._sent_v, self._sent_at = np.zeros(n), np.zeros(n), NEVER_NS
         """Newest command of positions [rad], its speed [rad/s] and its time [ns]."""
         self._fault: str | None = None
-        """Why arm or F/T sensor do not allow commands."""
+        """Fault of the arm or the F/T sensor; no command is accepted with one."""
         self._sums, self._summed = np.zeros(6 + 2 * n + len(measured.torque)), 0
         self._means = self._sums
         self._states = self._commands = 0
@@ -316,7 +316,7 @@ class HardwareService(Service):
     def _moved(self, t: int, values: Array | None) -> Array:
         """Return the positions to send at `t` [ns]: `values`, or where the arm stops from the last ones, and stays [rad].
 
-        An arm that takes no commands, or had none of late, may have been moved by hand: it stays where it is.
+        An arm that takes no commands, or had no recent one, may have been moved by hand: it stays where it is.
         """
         arm, elapsed_s = self._arm, (t - self._sent_at) / NS
         if values is not None:
