@@ -16,7 +16,7 @@ import zenoh
 
 from palpate.exam_state import exam_state
 from palpate_bus.contract import contract
-from palpate_bus.messages import NS, ExamState, IndentationTruth, Point, ServiceReport, SupervisorState, header
+from palpate_bus.messages import MS, NS, ExamState, IndentationTruth, Point, ServiceReport, SupervisorState, header
 from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
@@ -87,6 +87,23 @@ def test_a_pause_has_a_bound_and_is_named(session: zenoh.Session) -> None:
     assert failed.value.failure.code is FailureCode.STOPPED
     conductor.grants.pace("resume", 0)
     conductor._extend_grant()
+
+
+def test_steps_do_not_pass_the_end_that_planning_may_announce_nor_what_the_recorder_can_take() -> None:
+    stepped = grants.Grants(lambda tick, last: None, Timing())
+    stepped.begin()
+    stepped.pace("pause", 0)
+    stepped.extend(490 * MS, None, 450 * MS)
+    stepped.pace("step", 500)
+    for recorded in (450, 400):  # both are behind, then only the recorder is
+        with pytest.raises(UserError, match="step of 500 ms: planning or the recorder"):
+            stepped.pace("step", 500)
+        stepped.extend(990 * MS, None, recorded * MS)
+    stepped.extend(990 * MS, None, 950 * MS)
+    stepped.pace("step", 500)
+    stepped.pace("resume", 0)
+    stepped.extend(NS, 2 * NS, NS)  # announced a second ahead
+    assert not stepped.last
 
 
 @pytest.mark.parametrize("wallclock", [True, False])
