@@ -17,6 +17,7 @@ from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, Scores, TruthRow
 from palpate.truth.pressed import Pressed, Touched, TrueBody, press_patient
 from palpate_bus import implementations
+from palpate_bus.messages import NS, nanoseconds
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.settings import Settings
@@ -303,4 +304,6 @@ def _surface(scenario: Scenario, surface: Any | None, body: TrueBody | None) -> 
         return None
     centre, half = np.array(scenario.exam.centre_m), 0.5 * np.array(scenario.exam.region_m)
     perceived = apply(inverse(body.X_WA), evidence.points(surface))
+    motion, stamp = BodyMotion(scenario.phantom.motion, scenario.seed), nanoseconds(surface.header.stamp) / NS
+    perceived = motion.on_body(np.full(len(perceived), stamp), perceived)  # of a second scan, the body that has moved
     return scoring.surface_error(perceived, body, centre - half, centre + half)

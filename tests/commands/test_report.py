@@ -12,16 +12,17 @@ import typer
 from conductor_messages import FOUND, SCENARIO, collected, result
 from rich.console import Console
 
-from palpate.report.evidence import steady_contact
+from palpate.report.evidence import points, steady_contact
 from palpate.report.page import write_page
 from palpate.report.results import Known, assemble, clean_world, print_findings, scores_text, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
-from palpate_bus.messages import ExamState, RobotStatus, blank
+from palpate_bus.messages import NS, ExamState, RobotStatus, blank, header
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult, gave_up
+from palpate_models.numerics.frames import apply, inverse
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -64,6 +65,16 @@ def test_depth_error_is_of_the_true_depth_in_steady_contact(felt: Known) -> None
     assert report.depth.measured_against_true_m == pytest.approx(0.0005)
     assert report.depth.true_against_setpoint_lump_m == pytest.approx(0.0007)
     assert report.depth.force_limited == 0.0
+
+
+def test_the_error_of_a_second_scan_is_without_the_patients_motion(felt: Known) -> None:
+    turn = Motion(kind="turn", at_s=1.0)
+    moved = SCENARIO.model_copy(update={"phantom": SCENARIO.phantom.model_copy(update={"motion": turn})})
+    c, X_WA = collected(), felt.body.X_WA
+    X_WW = X_WA @ BodyMotion(turn, moved.seed).pose(60.0) @ inverse(X_WA)
+    c.surface.header = header(60 * NS, "world")
+    c.surface.vertices = apply(X_WW, points(c.surface)).astype(np.float32).ravel()
+    assert assemble(moved, result(c), felt).surface_rms_error_m == pytest.approx(0.0005, abs=1e-5)
 
 
 def test_states_without_a_truth_of_their_stamp_are_left_out() -> None:
