@@ -310,12 +310,14 @@ def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -
 def move_to_mapped(readings: Readings, mapping: Mapping) -> Readings:
     """Return the readings of the mapped point, with the force on the tool in the axes of the positions, without weight."""
     force, turn, position = readings.force, readings.rotation, readings.position
-    if force.shape[1] == 3:
-        if mapping.force.axes == "tool":
-            if turn is None:
-                raise ReadingError("force.axes = tool: the recording has no orientation; expected recording or table.orientation")
-            force = (turn * Rotation.from_euler("xyz", mapping.force.rpy_rad)).apply(force)
-        force = (force if mapping.force.on == "tool" else -force) - mapping.tool.mass_kg * np.array(mapping.gravity_mps2)
+    three = force.shape[1] == 3
+    if three and mapping.force.axes == "tool":
+        if turn is None:
+            raise ReadingError("force.axes = tool: the recording has no orientation; expected recording or table.orientation")
+        force = (turn * Rotation.from_euler("xyz", mapping.force.rpy_rad)).apply(force)
+    force = force if mapping.force.on == "tool" else -force
+    if three:
+        force = force - mapping.tool.mass_kg * np.array(mapping.gravity_mps2)
     if any(mapping.tool.offset_m):
         if turn is None:
             raise ReadingError("tool.offset_m: the recording has no orientation, so that the offset cannot be turned")
