@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from palpate.recording.recording import PalpationRecording
     from palpate.report.rows import Report
     from palpate_conductor.collector import Collected
+    from palpate_models.scenario.schema import Scenario
 
 
 def assess(
@@ -58,33 +59,15 @@ def assess(
 
 def write_assessed(folder: Path, recording: PalpationRecording, gathered: Collected) -> tuple[Report, Path]:
     """Write the results of a recording into a folder, as those of a run; return report and page."""
-    import numpy as np
-
-    from palpate.recording.assessed import region
     from palpate.recording.faults import Remedy
-    from palpate.recording.recording import ContactKind
     from palpate.report.page import write_page  # its figures take memory that the assessment needs before
     from palpate.report.results import write_results
     from palpate.report.rows import FaultRow, RecordedRow
     from palpate_bus.runs.run_folder import name_run
     from palpate_conductor.outcome import RunResult
     from palpate_models.scenario.load import dump_scenario
-    from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
-    from palpate_models.section import Pose
 
-    samples = recording.samples()
-    centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
-    sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
-    smallest, largest = 1e-3, 1.0
-    exam = Exam(
-        pose=Pose(),
-        centre_m=centre,
-        region_m=tuple(np.clip(size, smallest, largest).tolist()),
-        depth_m=recording.depth_m if samples else Exam().depth_m,
-        spacing_m=max(spacing, smallest),
-        mode=Mode.CONTINUOUS if sliding else Mode.POINT,
-    )
-    scenario = Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
+    scenario = scenario_of(recording)
     times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]
     result = RunResult("recording", gathered, sim_time_s=max(times, default=0.0))
     faults = [
@@ -94,3 +77,26 @@ def write_assessed(folder: Path, recording: PalpationRecording, gathered: Collec
     (folder / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
     recorded = RecordedRow(abdomen=recording.abdomen, faults=faults)
     return write_results(folder, scenario, result, recorded), write_page(folder)
+
+
+def scenario_of(recording: PalpationRecording) -> Scenario:
+    """Return the scenario of a recording: its sizes, where an examination's limits exclude them the nearest allowed ones."""
+    import numpy as np
+
+    from palpate.recording.assessed import region
+    from palpate.recording.recording import ContactKind
+    from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
+    from palpate_models.section import Pose
+
+    samples = recording.samples()
+    centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
+    sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
+    exam = Exam(
+        pose=Pose(),
+        centre_m=centre,
+        region_m=tuple(np.clip(size, 0.001, 1.0).tolist()),
+        depth_m=float(np.clip(recording.depth_m, 0.0002, 0.05)) if samples else Exam().depth_m,
+        spacing_m=float(np.clip(spacing, 0.001, 0.05)),
+        mode=Mode.CONTINUOUS if sliding else Mode.POINT,
+    )
+    return Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))

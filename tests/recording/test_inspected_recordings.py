@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
+from palpate.recording.command import scenario_of
 from palpate.recording.inspect import propose
 from palpate.recording.mapping import read_mapping
 from palpate.recording.read import read_recording
@@ -77,6 +78,28 @@ def test_probes_may_have_names_and_yaml_takes_on_for_true(file: Path) -> None:
     recording = read_recording(file, file.with_name("mapping.yaml"))
     assert len(recording.touches) == 36
     assert not recording.faults
+
+
+def test_the_sign_of_a_single_column_of_force_is_proposed_and_used(file: Path) -> None:
+    table = probes("one force")
+    table[table.columns[-1]] *= -1
+    mapping = read_mapping(proposed(file, table)[1])
+    assert mapping.force.on == "body"
+    assert not read_recording(file, mapping).faults
+
+
+@pytest.mark.parametrize(("wide", "deep"), [(12, 1), (1, 20)], ids=["60 mm apart", "60 mm deep"])
+def test_sizes_that_no_examination_allows_have_a_scenario(file: Path, wide: float, deep: float) -> None:
+    table = probes()
+    table[["x", "y"]] *= wide
+    table[["z", "fz"]] *= deep
+    mapping = read_mapping(proposed(file, table)[1])
+    ball = mapping.tool.model_copy(update={"radius_m": 0.01 * max(1.0, 0.1 * deep)})
+    recording = read_recording(file, mapping.model_copy(update={"tool": ball}))
+    assert recording.touches
+    exam = scenario_of(recording).exam
+    assert exam.depth_m == pytest.approx(np.clip(recording.depth_m, 0.0002, 0.05))
+    assert exam.spacing_m == pytest.approx(min(0.005 * wide, 0.05), rel=0.1)
 
 
 @pytest.mark.parametrize(("scale", "printed"), [(1.0, False), (1 / 9.80665, True)])
