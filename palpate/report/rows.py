@@ -7,6 +7,7 @@ from typing import Any, Final
 from pydantic import BaseModel, ConfigDict
 
 from palpate_bus.messages import Finding
+from palpate_bus.messages.codes import FindingKind
 from palpate_bus.runtime.failure import FailureCode
 
 Point = tuple[float, ...]
@@ -14,10 +15,6 @@ Point = tuple[float, ...]
 
 class _Row(BaseModel):
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
-
-
-KINDS: Final = ("lump", "muscle", "ridge", "bone", "soft_defect")
-"""Names of the kinds of Finding.msg, by number."""
 
 
 class FindingRow(_Row):
@@ -53,7 +50,7 @@ def finding_rows(areas: Iterable[Any]) -> list[FindingRow]:
             centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
             area_m2=f.area,
             ratio_90=(f.ratio_lower, f.ratio_upper),
-            kind=KINDS[f.kind],
+            kind=FindingKind(f.kind).name.lower(),
             **{name: getattr(f, name) for name in ("quadrant", "ratio", "confidence", *OTHERS)},
         )
         for f in areas
