@@ -164,44 +164,14 @@ def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
     return cloud.where(np.asarray(sheet == best, np.bool_))
 
 
-Index = NDArray[np.intp]
-
-
-def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the nodes of a lattice and the mask of those with data, as a voxel grid of the lattice's spacing does.
-
-    The nodes themselves, not the centroids of the points in their cells, keep spacing and ends exact.
-
-    Args:
-        p: points in A [m], shape (n, 3).
-        x: coordinates of the lattice's nodes along x [m], evenly spaced, shape (nx,).
-        y: the same along y, shape (ny,).
-
-    Returns:
-        xy of the nodes [m], shape (nx * ny, 2), y fastest, and whether a node's cell has a point, shape (nx * ny,).
-    """
-    i, j = (_nearest(s, coordinate) for s, coordinate in ((x, p[:, 0]), (y, p[:, 1])))
-    inside = (i >= 0) & (j >= 0)
-    seen = np.zeros((len(x), len(y)), np.bool_)
-    seen[i[inside], j[inside]] = True
-    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    return nodes, seen.ravel()
-
-
-def find_supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
+def find_supported(p: Array, xy: Array, spacing: float | Array) -> Mask:
     """Step 4: return the mask of targets whose cell has a point, shape (m,).
 
-    `p`: points in A [m], shape (n, 3); `xy`: targets in A [m], shape (m, 2); cells are squares of the side `spacing` [m].
+    `p`: points in A [m], shape (n, 3); `xy`: targets in A [m], shape (m, 2); cells are squares of the side `spacing` [m], or
+    rectangles of its two sides, shape (2,).
     """
-    distance, _ = cKDTree(p[:, :2]).query(xy, p=np.inf, distance_upper_bound=spacing / 2)
+    distance, _ = cKDTree(p[:, :2] / spacing).query(xy / spacing, p=np.inf, distance_upper_bound=0.5)
     return np.isfinite(distance)
-
-
-def _nearest(station: Array, coordinate: Array) -> Index:
-    """Return the index of the nearest station; -1 if it is further than half a step."""
-    step = station[1] - station[0] if len(station) > 1 else np.inf
-    i = np.clip(np.rint((coordinate - station[0]) / step), 0, len(station) - 1).astype(np.intp)
-    return np.where(np.abs(coordinate - station[i]) <= step / 2, i, -1)
 
 
 Image = NDArray[np.float32]
@@ -237,11 +207,8 @@ class DepthFusion:
         self._frames: list[Image] = []
 
     def add(self, depth: Image) -> None:
-        """Add a full frame [m], shape (height, width), NaN where invalid. Raises ValueError if its size differs."""
-        cut = np.array(depth[self.window], np.float32)
-        if self._frames and cut.shape != self._frames[0].shape:
-            raise ValueError(f"depth frame: window of shape {cut.shape}; previous frames had {self._frames[0].shape}")
-        self._frames.append(cut)
+        """Add a full frame [m], shape (height, width), NaN where invalid. All must have the size of the first."""
+        self._frames.append(np.array(depth[self.window], np.float32))
 
     @property
     def frames(self) -> int:

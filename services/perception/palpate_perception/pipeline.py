@@ -179,7 +179,8 @@ class Pipeline:
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = stations(cx + shift[0], width + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         y = stations(cy + shift[1], height + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
-        nodes, known = cloud.downsample(p_A, x, y)
+        nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        known = cloud.find_supported(p_A, nodes, np.array((x[1] - x[0], y[1] - y[0])))
         keep = binary_dilation(known.reshape(len(x), len(y)), iterations=2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
         a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
