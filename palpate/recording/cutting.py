@@ -5,12 +5,11 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, find_objects, label, median_filter
 from scipy.signal import find_peaks
 
 from palpate.recording.motion import TUNING
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 
 POWERS: Final = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 """Powers of depth that the force of loading is compared with."""
@@ -117,13 +116,13 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
     return Cut(touching, int((~near[lowest] & (rise > 0.5 * usual)).sum()))
 
 
-def peaks(values: Array, min_rise: float) -> tuple[NDArray[np.intp], Array]:
+def peaks(values: Array, min_rise: float) -> tuple[Indices, Array]:
     """Return the maxima that rise by `min_rise` over the minima on both sides: their indices, and the lesser rise; shape (k,)."""
     at, found = find_peaks(values, prominence=min_rise)
     return at, found["prominences"]
 
 
-def _split(one: slice, at: NDArray[np.intp]) -> list[slice]:
+def _split(one: slice, at: Indices) -> list[slice]:
     """Return the parts of a slice between indices."""
     ends = [one.start, *(int(k) for k in at if one.start < k < one.stop), one.stop]
     return [slice(a, b) for a, b in pairwise(ends)]
@@ -167,7 +166,7 @@ def path_length(position: Array) -> Array:
     return np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))
 
 
-def windows(lateral: Array, travel: float) -> list[NDArray[np.intp]]:
+def windows(lateral: Array, travel: float) -> list[Indices]:
     """Return the readings of each stretch of `travel` [m] of a path, shape (k, 3)."""
     number = np.floor(path_length(lateral) / travel).astype(int)
     return [part for part in np.split(np.arange(len(number)), np.flatnonzero(np.diff(number)) + 1) if len(part) >= 3]

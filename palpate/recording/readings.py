@@ -21,7 +21,7 @@ from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
 from palpate_errors import UserError
 from palpate_inputs import KB, MB, InputFile, bounds, check_xml, over, read_bytes, read_text
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_plugins import needs
 
 TABLES: Final = (".csv", ".tsv", ".txt", ".parquet")
@@ -58,11 +58,11 @@ class Readings:
     """Outward, shape (n, 3)."""
     touch: Array | None = None
     """Position at first contact [m], shape (n, 3)."""
-    clipped: NDArray[np.bool_] | None = None
+    clipped: Mask | None = None
     """True where the force is at the end of the sensor's range, shape (n,)."""
 
     @property
-    def whole(self) -> NDArray[np.bool_]:
+    def whole(self) -> Mask:
         """True where the force is within the sensor's range, shape (n,)."""
         return np.ones(len(self.position), bool) if self.clipped is None else ~self.clipped
 

@@ -16,7 +16,7 @@ from palpate.report.archive import Evidence
 from palpate.report.evidence import map_of
 from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.numerics.maps import half_width, level_lines
 from palpate_models.patient.mesh import vertex_normals
 
@@ -215,7 +215,7 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], d
     return scales, data
 
 
-def _labels(shape: Array, known: NDArray[np.bool_], middle: Array, abdomen: bool) -> dict[str, Any]:
+def _labels(shape: Array, known: Mask, middle: Array, abdomen: bool) -> dict[str, Any]:
     """Return the axes of the abdomen frame A at the corner of the scanned region, as segments, and labels with positions.
 
     `shape`: vertices about `middle`, which is a point in A, shape (n, 3) [m]; x points to the patient's left, y to the head.

@@ -17,7 +17,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 import palpate_models
 from palpate_models.numerics.cache import content_key, remember
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
 from palpate_models.patient.mesh import vertex_normals
@@ -121,7 +121,7 @@ class Pressed(NamedTuple):
     """Places [m], on the skin at rest, shape (p, 3), in A."""
     force: Array
     """Force of the patient as is [N], shape (p,)."""
-    limited: NDArray[np.bool_]
+    limited: Mask
     """True where the press ended at its limit, shape (p,)."""
     healthy: Array
     """Without any lump [N], shape (p,)."""
@@ -173,7 +173,7 @@ def press_patient(scenario: Scenario) -> Pressed | None:
     words = (phantom.model_copy(update={"breathing": Breathing(kind="none")}), scenario.services.tissue, radius)
     key = content_key("pressed", _code(scenario), *arrays, places, *words)
 
-    def press(tissue: TissueBackend, where: NDArray[np.bool_], otherwise: Array) -> Array:
+    def press(tissue: TissueBackend, where: Mask, otherwise: Array) -> Array:
         felt = otherwise.copy()
         if where.any():
             felt[where] = tissue.press(places[where], normals[where], radius)[0]
@@ -225,7 +225,7 @@ def _places(skin: TrueSurface, exam: Exam, areas: Sequence[Lesion | Structure]) 
     return places[on_skin], normals[on_skin]
 
 
-def _near(places: Array, areas: Sequence[Lesion | Structure]) -> NDArray[np.bool_]:
+def _near(places: Array, areas: Sequence[Lesion | Structure]) -> Mask:
     """Return True where each area may be palpable, shape (l, p)."""
     near = [edge_distance(places[:, :2], area) <= GRID.reach_m + (area.depth_m or 0.0) for area in areas]
     return np.array(near, dtype=bool).reshape(len(areas), len(places))

@@ -14,7 +14,7 @@ from palpate.report.files import write_text
 from palpate.report.scoring import Map
 from palpate.twin.fit import FittedWall, fit_wall, simulate, skin_at
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.field import lesion_field
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion
@@ -194,7 +194,7 @@ def _relative(recorded: Array, twin: Array) -> float:
     return float(np.sqrt(np.mean((twin - recorded) ** 2) / np.mean(recorded**2)))
 
 
-def _draw(path: Path, places: Array, felt: Array, expected: Array, held_out: NDArray[np.bool_]) -> None:
+def _draw(path: Path, places: Array, felt: Array, expected: Array, held_out: Mask) -> None:
     """Draw recorded and simulated forces side by side, and against each other."""
     figure = Figure(figsize=(14, 4.2), layout="constrained")
     maps = figure.subplots(1, 3)

@@ -10,6 +10,7 @@ from palpate_models.section import Pose
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 Ints = NDArray[np.int64]
 
 

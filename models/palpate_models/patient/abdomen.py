@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient.field import smoothstep
 from palpate_models.patient.mesh import orient, vertex_normals
 from palpate_models.patient.schema import Anatomy, Skeleton
@@ -65,7 +65,7 @@ class Shape(NamedTuple):
     vertices: Array
     triangles: NDArray[np.int32]
     normals: Array
-    fixed: NDArray[np.bool_]
+    fixed: Mask
 
 
 class _Body:
@@ -146,7 +146,7 @@ def _grade(half: float, other_distance: float, inner: float, edge: float) -> Arr
     return np.interp(np.linspace(0, count[-1], max(3, round(count[-1]) + 1)), count, x)
 
 
-def _strip(left: NDArray[np.intp], right: NDArray[np.intp]) -> NDArray[np.int32]:
+def _strip(left: Indices, right: Indices) -> NDArray[np.int32]:
     """Triangles between two chains of as many vertices; chains may share their first vertex."""
     quads = np.column_stack((left[:-1], right[:-1], right[1:], left[1:]))
     triangles = np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
@@ -174,7 +174,7 @@ def _close(plan: Array, inner: int, outer: tuple[float, float]) -> NDArray[np.in
     index = np.arange(inner, len(plan))
     s, y = plan[inner:].T
 
-    def chain(mask: NDArray[np.bool_], key: Array) -> NDArray[np.intp]:
+    def chain(mask: Mask, key: Array) -> Indices:
         return np.asarray(index[mask][np.argsort(key[mask])], dtype=np.intp)
 
     parts = [_strip(chain((y == end) & (s <= 0), -s), chain((y == end) & (s >= 0), s)) for end in (-outer[1], outer[1])]

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient.schema import Background, Lesion, Structure
 from palpate_models.patient.wall import Guarding
@@ -129,7 +129,7 @@ def edge_distance(xy: Array, area: Lesion | Guarding | Structure) -> Array:
     return np.asarray(np.where(rho > 1e-6, (rho - 1) * rho / np.maximum(slope, 1e-9), -radii.min()))
 
 
-def lesion_field(xy: Array, lesions: Sequence[Lesion], front: NDArray[np.bool_] | None = None) -> tuple[Array, NDArray[np.int32]]:
+def lesion_field(xy: Array, lesions: Sequence[Lesion], front: Mask | None = None) -> tuple[Array, NDArray[np.int32]]:
     """Stiffness with lesions over stiffness without, and the lesion that a point belongs to (-1: none), both (n,).
 
     The contrast rises over `edge_m`, centred on the outline, so the outline is where it is half. Where lesions overlap, the one

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import Delaunay
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.abdomen import lattice, parametric_surface
 from palpate_models.patient.field import background_factor, lesion_field, structure_at_skin, structure_share
 from palpate_models.patient.grid import read_grid
@@ -54,7 +54,7 @@ class PhantomModel:
     """Additional modulus of contracted muscle relative to k_w [1], shape (n,); 0 without guarding."""
     lesion: IntArray
     """Index of the lesion in whose half-contrast outline the vertex lies, -1 elsewhere, shape (n,)."""
-    fixed: NDArray[np.bool_]
+    fixed: Mask
     """Vertices that do not move: the border of the examined body, and its back on the table; shape (n,)."""
     breathing: Array
     """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
@@ -133,7 +133,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     )
 
 
-def _breathing_profile(vertices: Array, normals: Array, fixed: NDArray[np.bool_]) -> Array:
+def _breathing_profile(vertices: Array, normals: Array, fixed: Mask) -> Array:
     """Share of the excursion, shape (n,): largest about the umbilicus, none at the ends, the flanks and the back."""
     y = vertices[:, 1]
     along = np.cos(np.where(y > 0, y / y.max(), y / y.min()) * np.pi / 2) ** 2

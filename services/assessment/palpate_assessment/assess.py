@@ -16,7 +16,7 @@ from palpate_assessment.observations import USABLE, Observations, distance_to_sa
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.messages.codes import UnassessedReason
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.scenario.schema import Marked
 
 _MOST_CONTRADICTED = 0.3
@@ -94,7 +94,7 @@ SURPRISE = 1e-5
 examinations where the model holds."""
 
 
-def find_contradicted(regression: Regression) -> NDArray[np.bool_]:
+def find_contradicted(regression: Regression) -> Mask:
     """Return the mask of samples in a piece of a stroke that the others contradict, shape (m,): a posterior predictive check.
 
     With the covariance K of all observations and P = K^-1, the piece k held out has the residual e = (P_kk)^-1 (P y)_k with
@@ -111,7 +111,7 @@ def find_contradicted(regression: Regression) -> NDArray[np.bool_]:
     return marked
 
 
-def pieces(o: Observations) -> list[NDArray[np.intp]]:
+def pieces(o: Observations) -> list[Indices]:
     """Indices of the samples of each piece: strokes cut at every `piece_m` of travel."""
     step = np.hypot(*np.diff(o.xy, axis=0, prepend=o.xy[:1]).T)
     travel = np.cumsum(np.where(np.diff(o.stroke, prepend=o.stroke[0]) == 0, step, 0.0))

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 from scipy.special import expit, log_ndtr
 
@@ -14,10 +13,8 @@ from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression
 from palpate_assessment.shapes import Bump, ridge
 from palpate_bus.messages.codes import FindingKind
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.schema import Marked
-
-Mask = NDArray[np.bool_]
 
 Z90 = 1.6449
 """Two-sided 90 % quantile of the normal distribution."""

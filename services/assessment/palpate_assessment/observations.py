@@ -8,12 +8,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import PressStandard
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 
 
 class Usable(NamedTuple):
@@ -48,10 +47,10 @@ class Observations:
     """Place of each sample [m], shape (m, 2), in A: ahead of the indenter's middle by `lead_s` of its travel."""
     time: Array
     """[s]"""
-    stroke: NDArray[np.intp]
+    stroke: Indices
     y: Array
     """log F - n log(depth / press depth), less the usual conversion of slides or held presses, shape (m,)."""
-    slid: NDArray[np.bool_]
+    slid: Mask
     """True for samples of slides, which share this patient's own conversion; presses are felt as they are."""
     rate: Array
     """Log of a slide's speed over the median one, shape (m,); 0 for presses."""
@@ -71,11 +70,11 @@ class Observations:
     """SD of the depth, as reported [m], shape (m,)."""
     exponent: Array
     """n of F ~ depth^n in the descent to a held press, shape (m,); 0 for other samples."""
-    yielded: NDArray[np.bool_]
+    yielded: Mask
     """True if the force limit was met at a depth too small to estimate the force of a full press."""
 
     @cached_property
-    def same_stroke(self) -> NDArray[np.bool_]:
+    def same_stroke(self) -> Mask:
         """True where two samples are of one stroke, shape (m, m)."""
         return np.asarray(self.stroke[:, None] == self.stroke)
 
@@ -90,7 +89,7 @@ class Observations:
         sides = self.hull.equations
         return float(-(self.xy[self.hull.vertices] @ sides[:, :2].T + sides[:, 2]).min(axis=0).max())
 
-    def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
+    def part(self, chosen: Indices | slice) -> Observations:
         """Return some of the samples."""
         return replace(self, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "standard"})
 

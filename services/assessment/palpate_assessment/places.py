@@ -6,12 +6,11 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, cKDTree
 
 from palpate_assessment.sampling import ForceSample
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 
 _GAP: Final = 2.0
 """Maximum circumradius of a triangle of samples without a gap, over their usual distance."""
@@ -48,11 +47,11 @@ class SampledPlaces:
         return float(np.sqrt(2) * np.median(self.circumradii[whole if whole.any() else slice(None)]))
 
     @cached_property
-    def filled(self) -> NDArray[np.bool_]:
+    def filled(self) -> Mask:
         """True for triangles without a gap of many samples, as in a notch of the region, shape (t,)."""
         return np.asarray(self.circumradii <= _GAP * self.spacing)
 
-    def encloses(self, places: Array) -> NDArray[np.bool_]:
+    def encloses(self, places: Array) -> Mask:
         """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
         inside = self.mesh.find_simplex(places)
         return np.asarray((inside >= 0) & self.filled[inside])

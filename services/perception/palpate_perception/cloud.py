@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
 from palpate_models.scenario.schema import Exam
 
 
@@ -59,10 +59,10 @@ class Cloud(NamedTuple):
     """Positions [m] in world, shape (n, 3)."""
     sigma: Array
     """Standard deviation along the viewing ray [m], shape (n,)."""
-    pixel: NDArray[np.intp]
+    pixel: Indices
     """Row and column in the fused window, shape (n, 2)."""
 
-    def where(self, keep: NDArray[np.bool_]) -> "Cloud":
+    def where(self, keep: Mask) -> "Cloud":
         """Return the points of a mask, shape (n,)."""
         return Cloud(self.p_W[keep], self.sigma[keep], self.pixel[keep])
 
@@ -86,7 +86,7 @@ class RegionBox(NamedTuple):
         grid = np.meshgrid(*zip(self.low, self.high, strict=True), indexing="ij")
         return np.stack([axis.ravel() for axis in grid], axis=1)
 
-    def holds(self, p_A: Array) -> NDArray[np.bool_]:
+    def holds(self, p_A: Array) -> Mask:
         """Return the mask of points in A, shape (n, 3), inside the box."""
         return np.asarray(np.all((p_A >= self.low) & (p_A <= self.high), axis=1))
 
@@ -140,7 +140,7 @@ def crop(cloud: Cloud, X_WA: Array, box: RegionBox, floor_m: float) -> Cloud:
     return cloud.where(np.asarray(inside & (cloud.p_W[:, 2] > floor_m)))
 
 
-def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
+def main_sheet(cloud: Cloud, depth: Array, inside: Mask) -> Cloud:
     """Step 3, second part: split the cloud into sheets at depth jumps and keep the one with most points `inside`.
 
     Objects above the skin (arm, tool, stray pixels) are on other sheets. `depth`: the fused window [m]; `inside`:
@@ -222,7 +222,7 @@ class DepthFusion:
         """
         self._frames = [frame - np.float32(d) * per_metre for frame, d in zip(self._frames, displacements, strict=True)]
 
-    def motion(self, depth: Image, pixel: NDArray[np.intp]) -> float:
+    def motion(self, depth: Image, pixel: Indices) -> float:
         """Return the SD [m] over the frames of their mean offset from `depth` at pixels.
 
         `pixel`: rows and columns in the window, shape (n, 2). Noise averages out over thousands of pixels; a moving surface, as

@@ -12,10 +12,9 @@ and its part slower than `DRIFT.tau_s` is subtracted from all depths.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
 from palpate_models.robot.arm import capsules, link_transforms
 from palpate_models.robot.table import TABLE
 from palpate_models.scenario.schema import Exam, Robot
@@ -47,7 +46,7 @@ class ArmMask:
         self._robot = robot
         self._capsules = capsules(robot)
 
-    def hides(self, q: Array, p_WC: Array, r_W: Array, z: Array) -> NDArray[np.bool_]:
+    def hides(self, q: Array, p_WC: Array, r_W: Array, z: Array) -> Mask:
         """Return the mask of wall points p_WC + z r_W that may be hidden or dented at joint positions `q` [rad], shape (n,).
 
         `r_W`: viewing directions, shape (n, 3); `z` [m]: distance of the wall along them, shape (n,).
@@ -55,7 +54,7 @@ class ArmMask:
         starts, ends, radii = self._segments(q)
         towards = z[:, np.newaxis] * r_W  # from the camera to the wall
         hidden = passes(towards, starts - p_WC, ends - p_WC, radii + MARGINS.arm_m)
-        dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < MARGINS.dent_m
+        dented: Mask = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < MARGINS.dent_m
         return hidden | dented
 
     def _segments(self, q: Array) -> tuple[Array, Array, Array]:
@@ -73,7 +72,7 @@ class ArmMask:
 
 
 @compiled
-def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
+def passes(a: Array, p: Array, q: Array, reach: Array) -> Mask:
     """Return the mask of segments from 0 to `a`, shape (n, 3), nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
 
     Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1]. Most
@@ -123,7 +122,7 @@ class CameraDrift:
         height = camera.X_WC[2, 3] + depth * r_W[:, 2]
         table = np.abs(height - TABLE.top_m) < DRIFT.table_distance_m
         table[table] &= noise[table] < WALL_FIT.edge_noise * np.median(noise[table]) if table.any() else False
-        self.pixel: NDArray[np.intp] = pixel[table]
+        self.pixel: Indices = pixel[table]
         """Flat indices of the pixels that show the table, shape (n,)."""
         self.depth: Array = depth[table]
         """Their first depth [m], shape (n,)."""
@@ -133,7 +132,7 @@ class CameraDrift:
         """Current estimate [m]."""
         self._last_s = t_s
 
-    def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> float:
+    def follow(self, t_s: float, depth: Array, hidden: Mask) -> float:
         """Return the drift [m] after an image exposed at `t_s` [s]: depths [m] and mask of hidden pixels, (n,) each."""
         seen = np.isfinite(depth) & ~hidden
         if np.count_nonzero(seen) >= DRIFT.min_pixels:
@@ -286,7 +285,7 @@ class Follower:
         drift = table.follow(t_s, z[table.pixel], self._hidden(q, table.r_W, table.depth))
         return self._tracker.follow(t_s, z[wall.pixel] - drift, self._hidden(q, wall.r_W, wall.depth))
 
-    def _hidden(self, q: Array | None, r_W: Array, depth: Array) -> NDArray[np.bool_]:
+    def _hidden(self, q: Array | None, r_W: Array, depth: Array) -> Mask:
         """Return the mask of points at depths [m] along rays, (n,) and (n, 3), that the arm may hide at joint positions [rad]."""
         assert self._tracker is not None
         if q is None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from palpate_bus.messages.codes import ViewReason
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Mask, apply, inverse
 from palpate_models.robot.table import TABLE
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
@@ -155,7 +155,7 @@ class Pipeline:
         mesh = self._mesh(field, p_A, mode, shift)
         return Perceived(points, mesh, targets, sigma, fused.frames, coverage, ViewReason.NONE, message, field)
 
-    def _gaps(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> Gaps:
+    def _gaps(self, seen: Mask, p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> Gaps:
         xy, _ = visibility.cells(self._exam)
         missing = np.column_stack((xy[~seen], visibility.quadric(p_A, xy[~seen])))
         X_CA = inverse(camera.X_WC) @ self._X_WA

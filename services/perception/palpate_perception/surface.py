@@ -11,12 +11,11 @@ set by the length at which the gain is one half, which does not depend on noise 
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_array, csr_array, kron
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 
 
 class SurfaceTuning(NamedTuple):
@@ -51,7 +50,7 @@ class KnotAxis:
         clipped = np.clip(x, self.low, self.high)
         return np.asarray(self._splines(clipped, nu=derivative), np.float64)
 
-    def local(self, x: Array) -> tuple[Array, NDArray[np.intp]]:
+    def local(self, x: Array) -> tuple[Array, Indices]:
         """Return the DEGREE + 1 basis functions that are not zero at `x`, and their indices, shapes (n, DEGREE + 1)."""
         rows = BSpline.design_matrix(np.clip(x, self.low, self.high), self.knots, DEGREE)
         return rows.data.reshape(-1, DEGREE + 1), rows.indices.reshape(-1, DEGREE + 1).astype(np.intp)

@@ -33,9 +33,8 @@ from enum import Enum, auto
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array, apply
+from palpate_models.numerics.frames import Array, Indices, Mask, apply
 from palpate_perception import surface
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.surface import FittedSurface
@@ -105,7 +104,7 @@ class WallAverage:
         self._images = np.full(len(wall.pixel), float(watched))
         self._sum = np.zeros(len(wall.pixel))
 
-    def add(self, still: Array, seen: NDArray[np.bool_]) -> None:
+    def add(self, still: Array, seen: Mask) -> None:
         """Add an image: outward displacement without the breath [m] and mask of visible pixels, shape (n,) each."""
         self._images += seen
         self._sum += np.where(seen, still, 0.0)
@@ -240,7 +239,7 @@ class Tracker:
         self.moved = False
         """True if the patient has moved since the wall model was fitted."""
 
-    def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
+    def follow(self, t_s: float, depth: Array, hidden: Mask) -> Followed:
         """Process the wall's pixels of an image exposed at `t_s` [s]: depth [m] and mask of hidden pixels, (n,) each."""
         expected, spread = self._filter.forward(t_s)
         y = (depth - self.wall.depth) / self.wall.gain
@@ -333,7 +332,7 @@ class Tracker:
         return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
-def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp]) -> float | None:
+def jackknife(left: Array, weight: Array, lifts: Array, patch: Indices) -> float | None:
     """Return the variance [m^2] of d by patches, from residual [m], weight, mode and patch of each pixel, (n,) each.
 
     None if one patch has more weight than all others together, since the shared error is then unknown.
@@ -344,7 +343,7 @@ def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp])
     return float(np.sum((pull / (total.sum() - total)) ** 2))
 
 
-def _patches(p_A: Array) -> NDArray[np.intp]:
+def _patches(p_A: Array) -> Indices:
     """Return the number of the patch of the wall for each position [m], shape (n, 3) -> (n,)."""
     cell = np.floor((p_A[:, :2] - p_A[:, :2].min(axis=0)) / TRACKING.patch_m).astype(np.intp)
     return np.asarray(np.unique(cell, axis=0, return_inverse=True)[1]).ravel()

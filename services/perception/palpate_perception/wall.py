@@ -13,10 +13,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
 from palpate_models.robot.table import TABLE
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
@@ -74,7 +73,7 @@ class BreathingMode(NamedTuple):
 class WallPixels(NamedTuple):
     """Wall model at the n pixels of the small image that show it."""
 
-    pixel: NDArray[np.intp]
+    pixel: Indices
     """Flat indices, shape (n,)."""
     depth: Array
     """Depth at the end of expiration [m], shape (n,)."""
@@ -157,13 +156,13 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     return WallPixels(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
 
 
-def _check_count(keep: NDArray[np.bool_], what: str) -> None:
+def _check_count(keep: Mask, what: str) -> None:
     """Raise WallNotVisibleError if too few pixels are kept."""
     if (count := np.count_nonzero(keep)) < WALL_FIT.min_pixels:
         raise WallNotVisibleError(f"{count} pixels of the small image {what}, expected {WALL_FIT.min_pixels}")
 
 
-def find_steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
+def find_steady(frames: Array) -> tuple[Indices, Array, Array]:
     """Return the mostly valid pixels (flat), their mean depth and the noise of a frame [m], shape (n,) each."""
     flat = frames.reshape(len(frames), -1)
     pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > WALL_FIT.valid_share)

@@ -4,9 +4,8 @@ from abc import ABC, abstractmethod
 from math import isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.wall import Activation
@@ -54,7 +53,7 @@ class TissueBackend(ABC):
         self.settle()
         return self
 
-    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, Mask]:
         """Perform standard presses with a sphere of `radius` [m], each into the body at rest, and leave it at rest.
 
         Guarding muscle is contracted at rest; involuntary contraction stays during a press, voluntary contraction fades.
@@ -75,7 +74,7 @@ class TissueBackend(ABC):
 
     @property
     @abstractmethod
-    def contacts(self) -> NDArray[np.intp]:
+    def contacts(self) -> Indices:
         """Return the indices of the vertices in contact after the step, shape (k,)."""
 
     @property

@@ -12,11 +12,10 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 from palpate_models.numerics.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
 
 RIM = 0.2
@@ -34,7 +33,7 @@ class Near(NamedTuple):
     """Distance from `origin` within which the candidates are complete [m]."""
     radius: float
     """Radius of the sphere [m]."""
-    vertex: NDArray[np.intp]
+    vertex: Indices
     """Indices among the searched vertices, ascending, shape (m,)."""
     n: Array
     """Their outward normals, shape (m, 3)."""

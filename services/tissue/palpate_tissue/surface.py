@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 from palpate_models.numerics.vectors import Vector, add, dot, nearest_vertex, row, scale, subtract
 from palpate_models.patient.phantom import PhantomModel
 
@@ -102,7 +101,7 @@ def _share(offset: Vector, side: Vector) -> float:
     return min(max(dot(offset, side) / dot(side, side), 0.0), 1.0)
 
 
-def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:
+def _incident_faces(model: PhantomModel) -> list[Indices]:
     """Return the triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")

@@ -11,12 +11,11 @@ in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.standard import USUAL
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, press_duration
@@ -117,7 +116,7 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     duration = press_duration(posterior.here, task.places)
     exponent, spread = calibration.exponent, calibration.exponent_sd
 
-    def rate(some: NDArray[np.intp], depth: float) -> Array:
+    def rate(some: Indices, depth: float) -> Array:
         """Return information per second of presses at some of the places, shape (k,)."""
         noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2
         noise += USUAL.errors.white_sd**2

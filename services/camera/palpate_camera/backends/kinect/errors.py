@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from palpate_camera.backends.kinect.scene import Image, View
 from palpate_camera.messages import Pinhole
-from palpate_models.numerics.frames import Array, Mask
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.scenario.errors import DrawnCamera
 
 
@@ -109,13 +109,13 @@ class _Statistics(NamedTuple):
     """Inputs of the noise model at the n pixels that hit a surface."""
 
     view: View
-    pixel: NDArray[np.intp]
+    pixel: Indices
     u: NDArray[np.int32]
     v: NDArray[np.int32]
     axial: Vector
     """One value for every pixel of the image, flat: the noise is that of the surface which a jittered ray meets."""
     lateral: Vector
-    grazing: NDArray[np.intp]
+    grazing: Indices
     """Indices into the n at which loss is possible."""
     loss: Vector
     """Its probability there."""

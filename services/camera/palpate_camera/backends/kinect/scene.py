@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from palpate_camera.messages import Pinhole
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, Mask, apply, inverse
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
@@ -158,7 +158,7 @@ class Scene:
             self._merged = merged
         return self._merged
 
-    def visible_pixels(self, name: str) -> NDArray[np.bool_]:
+    def visible_pixels(self, name: str) -> Mask:
         """Return the pixels of `view` that show a layer, shape (height, width)."""
         w = self._layers[name][1].w
         return (w > 0) & (w >= self.view().w)

@@ -25,7 +25,7 @@ from scipy.special import j0
 
 from palpate_errors import UserError
 from palpate_models.numerics.cache import content_key, remember
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 from palpate_models.patient import field
 from palpate_models.patient.field import lesion_field, smoothstep
 from palpate_models.patient.phantom import PhantomModel
@@ -208,7 +208,7 @@ class Compliance(NamedTuple):
 
     matrix: Array32
     """S [m/N] on the free vertices, shape (f, f), symmetric and positive definite."""
-    free: NDArray[np.intp]
+    free: Indices
     """Free vertices, ascending, shape (f,)."""
     young: Array
     """Instantaneous Young's modulus at these vertices [Pa], shape (f,)."""
@@ -246,7 +246,7 @@ def compliance(
 
 class _Body(NamedTuple):
     model: PhantomModel
-    free: NDArray[np.intp]
+    free: Indices
     thickness: float
     poisson: float
     pitch: float

@@ -4,12 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from palpate_errors import RunError
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, Mask
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient import wall
 from palpate_tissue.contact import RIM, Near, Push
 
@@ -98,7 +97,7 @@ class VertexSprings(NamedTuple):
     tension: Array
     """[1], shape (m,)."""
 
-    def at(self, index: NDArray[np.intp]) -> "VertexSprings":
+    def at(self, index: Indices) -> "VertexSprings":
         """Return the springs of some of the vertices."""
         return VertexSprings(self.gain[index], self.stiffening[index], self.tension[index])
 
@@ -149,7 +148,7 @@ class ElasticPatch:
         self.force = np.zeros(len(near.vertex))
         """Contact forces f after the step, along the inward normals [N], shape (m,)."""
         self.vertex = near.vertex
-        self.within: NDArray[np.intp] = np.arange(len(near.vertex))
+        self.within: Indices = np.arange(len(near.vertex))
         """Positions in `vertex` of those that the sphere can hold."""
         self.deepest = math.inf
         """Displacement [m] up to which the step is passive."""
@@ -217,7 +216,7 @@ class SprungPatch(ElasticPatch):
     def __init__(
         self,
         near: Near,
-        vertex: NDArray[np.intp],
+        vertex: Indices,
         breathing: Array,
         state: Array,
         compliance: Array,

@@ -15,9 +15,8 @@ steps, and by S times the accumulated effect of the forces since then, which the
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
@@ -141,7 +140,7 @@ class ElasticTissue(TissueBackend):
         """See `TissueBackend`."""
         return ElasticTissue(self.model, self.compliance, self._stiffness, self.breathing, dt)
 
-    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, Mask]:
         """See `TissueBackend`. Uses long steps: the step is implicit, and the reading is at the end of the hold."""
         if self.dt >= TUNING.press_step_s:
             return super().press(places, normals, radius)
@@ -200,7 +199,7 @@ class ElasticTissue(TissueBackend):
         return u
 
     @property
-    def contacts(self) -> NDArray[np.intp]:
+    def contacts(self) -> Indices:
         """Return the vertices in contact after the step, shape (k,)."""
         patch = self._patch
         if patch is None or not self.touching:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices
 from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
 from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
@@ -64,9 +64,9 @@ linear
 class ImplicitPatch(NamedTuple):
     """The p vertices stepped near the sphere, of which m can be held; vectors in A."""
 
-    near: NDArray[np.intp]
+    near: Indices
     """Stepped vertices, shape (p,)."""
-    within: NDArray[np.intp]
+    within: Indices
     """Positions in `near` of the vertices that can be held, shape (m,)."""
     table: Array
     """Their outward normal (3), rest position [m] (3), and fraction of the breathing excursion, shape (m, 7)."""
@@ -165,7 +165,7 @@ def pull(wall: ImplicitWall, i: int, before: float, activation: float, length: f
 
 
 @compiled
-def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: float, stride: Stride) -> float:
+def sweep(wall: ImplicitWall, near: Indices, room: Array, activation: float, stride: Stride) -> float:
     """Sweep once over vertices with over-relaxation, bounded below by the sphere; return the largest motion [m]."""
     u, s, longest = wall.u, wall.s, 0.0
     for k in range(len(near)):
@@ -180,7 +180,7 @@ def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: f
 
 
 @compiled
-def relax(wall: ImplicitWall, near: NDArray[np.intp]) -> None:
+def relax(wall: ImplicitWall, near: Indices) -> None:
     """Update the Prony branches of stepped vertices, exact for a constant displacement over the step."""
     u, s, y, decay = wall.u, wall.s, wall.y, wall.decay
     for k in range(y.shape[1]):
@@ -192,7 +192,7 @@ def relax(wall: ImplicitWall, near: NDArray[np.intp]) -> None:
 
 
 @compiled
-def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation: float, sweeps: int) -> None:
+def follow(wall: ImplicitWall, vertices: Indices, now: int, activation: float, sweeps: int) -> None:
     """Advance vertices without contact to step `now`, each by one step of its own length, at most that of `decay`.
 
     First each vertex relaxes with its branches as if in equilibrium; then up to `sweeps` sweeps restore equilibrium, which is far
@@ -244,7 +244,7 @@ class ImplicitTuning(NamedTuple):
 
 
 TUNING: Final = ImplicitTuning()
-_NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+_NONE: Indices = np.empty(0, dtype=np.intp)
 
 
 class ImplicitTissue(TissueBackend):
@@ -340,7 +340,7 @@ class ImplicitTissue(TissueBackend):
         return ImplicitPatch(near, place[vertex], table, np.zeros(len(vertex)), np.empty((len(near), 2)))
 
     @property
-    def contacts(self) -> NDArray[np.intp]:
+    def contacts(self) -> Indices:
         """Return the vertices in contact after the step, shape (k,)."""
         patch = self._patch
         return _NONE if patch is None or not self.touching else patch.near[patch.within[patch.f > 0]]

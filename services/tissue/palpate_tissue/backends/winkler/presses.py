@@ -14,11 +14,10 @@ from math import exp, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.numerics.vectors import Vector, add, dot, row, scale, subtract
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
@@ -72,7 +71,7 @@ class Skin(NamedTuple):
 
 def standard_presses(
     model: PhantomModel, stiffness: Stiffness, places: Array, normals: Array, radius: float
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Array, Mask]:
     """Return the result of `TissueBackend.press` at `places` [m] with `normals`, shapes (k, 3), for a sphere of `radius` [m]."""
     ends = np.array(ENDS_S)
     depths = press.depths(ends)
@@ -119,7 +118,7 @@ def contract(voluntary: bool, ends: Array, depths: Array) -> Array:
 
 
 @compiled
-def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array, course: Course, forces: Array) -> None:
+def press_once(wall: ImplicitWall, skin: Skin, part: Indices, at: Array, course: Course, forces: Array) -> None:
     """Perform one frictionless press into a wall at rest and reset it. Only the vertices of `part` move.
 
     The wall has steps of 1 s. Rows of `at` (2, 3): place [m] and outward normal. `forces` (n,) is set to the forces along the
@@ -175,7 +174,7 @@ def floor(X: Vector, n: Vector, p: Vector, radius: float, normal: Vector) -> flo
 
 @compiled
 def hold_force(
-    wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], room: Array, activation: float, h: float, p: Vector, normal: Vector
+    wall: ImplicitWall, skin: Skin, part: Indices, room: Array, activation: float, h: float, p: Vector, normal: Vector
 ) -> float:
     """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, as in `tissue.hold`."""
     total = 0.0

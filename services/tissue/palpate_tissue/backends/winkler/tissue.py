@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
 from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
@@ -185,7 +185,7 @@ def relax(wall: Membrane) -> None:
             y[i] = y[i] * e + feed * wall.u[i]
 
 
-_NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+_NONE: Indices = np.empty(0, dtype=np.intp)
 _MARGIN_M = 0.005
 """Motion of the sphere after which the vertices near it are searched again."""
 
@@ -265,7 +265,7 @@ class WinklerTissue(TissueBackend):
         """See `TissueBackend`. Implicit steps."""
         return ImplicitTissue(self.model, self._stiffness, self.breathing, dt)
 
-    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+    def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, Mask]:
         """See `TissueBackend`. Uses a few long steps on the part of the wall that each press reaches."""
         return standard_presses(self.model, self._stiffness, places, normals, radius)
 
@@ -291,7 +291,7 @@ class WinklerTissue(TissueBackend):
         self._near = self._search.around(p, radius, deepest)
         self._patch = self._patch_of(self._free[self._near.vertex])
 
-    def _patch_of(self, index: NDArray[np.intp]) -> Patch:
+    def _patch_of(self, index: Indices) -> Patch:
         model = self.model
         table = np.column_stack((model.normals[index], model.vertices[index], model.breathing[index], self._gain[index]))
         return Patch(index.astype(np.uint32), table, np.zeros(len(index)))
@@ -319,7 +319,7 @@ class WinklerTissue(TissueBackend):
         return springs
 
     @property
-    def contacts(self) -> NDArray[np.intp]:
+    def contacts(self) -> Indices:
         """Return the vertices in contact after the step, shape (k,)."""
         return self._patch.vertex[self._patch.f > 0].astype(np.intp) if self.touching else _NONE
 
