@@ -116,7 +116,12 @@ class Collected:
         exam = self.exam
         if exam is None or (exam.end_tick < 0 and exam.phase not in _OVER):
             return None
-        return int(exam.end_tick) if exam.end_tick >= 0 else nanoseconds(exam.header.stamp)
+        return int(exam.end_tick) if self.end_announced else nanoseconds(exam.header.stamp)
+
+    @property
+    def end_announced(self) -> bool:
+        """True if planning has announced the end tick."""
+        return self.exam is not None and self.exam.end_tick >= 0
 
 
 class CollectedNews:

@@ -290,7 +290,7 @@ class Conductor:
         collected = self._collector.collected
         records = "recorder" in self._observers and "recorder" not in self.result.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
-        self.grants.extend(collected.exam_time, collected.end_tick, recorded)
+        self.grants.extend(collected.exam_time, collected.end_tick, recorded, collected.end_announced)
 
     def _check_progress(self, finished: Set[str]) -> None:
         """Warn about a stall, and end the run if it lasts too long, or a step of a foreign service does."""

@@ -59,11 +59,12 @@ class Grants:
         self.horizon, self.last, self._at = tick, last, monotonic()
         self._send(tick, last)
 
-    def extend(self, exam: int, end: int | None, recorded: int | None) -> None:
+    def extend(self, exam: int, end: int | None, recorded: int | None, announced: bool = True) -> None:
         """Grant as much as possible.
 
-        `exam` [ns] is the time of the newest exam state, -1 before the first, `end` the end tick it announces, `recorded` the
-        tick up to which the recorder has written, None without one.
+        `exam` [ns] is the time of the newest exam state, -1 before the first, `end` the end tick it announces or, if not
+        `announced`, the time at which the examination was over, `recorded` the tick up to which the recorder has written, None
+        without one.
 
         Raises RunFailed if planning announces an end that has passed or, in wall-clock mode, is silent.
         """
@@ -81,6 +82,8 @@ class Grants:
         if self._realtime is not None:
             tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
         tick = self.horizon if self.paused else max(tick - tick % MS, self.horizon)
+        if end is not None and not announced:
+            end = max(end, self.horizon)  # what is granted cannot be taken back
         if end is not None and end <= tick:
             if end < self.horizon:
                 text = f"planning announced the end at {end} ns after {self.horizon} ns had been granted"

@@ -89,6 +89,16 @@ def test_a_pause_has_a_bound_and_is_named(session: zenoh.Session) -> None:
     conductor._extend_grant()
 
 
+def test_an_examination_that_is_over_without_an_announced_end_ends_at_the_granted_time(session: zenoh.Session) -> None:
+    collector = Collector()
+    conductor = Conductor(session, contract(), 0, ("control",), collector)
+    conductor.grants.grant(10_500 * MS)
+    collector.collected.exam_states = [exam_state(10_010 * MS, ExamState.PHASE_DONE, end_tick=-1)]
+    collector.collected.exam_time = 10_010 * MS
+    conductor._extend_grant()
+    assert (conductor.grants.horizon, conductor.grants.last) == (10_500 * MS, True)
+
+
 def test_steps_do_not_pass_the_end_that_planning_may_announce_nor_what_the_recorder_can_take() -> None:
     stepped = grants.Grants(lambda tick, last: None, Timing())
     stepped.begin()
