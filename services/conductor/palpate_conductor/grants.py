@@ -23,6 +23,8 @@ class GrantTuning(NamedTuple):
     window_ns: int = 500 * MS
     """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
     recorder_window_ns: int = NS
+    step_window_ns: int = NS
+    """Simulated time [ns] beyond the newest exam state to which an operator may step; planning announces the end so early."""
     wallclock_lead_ns: int = 200 * MS
     """Time from the start message to the common start [ns]."""
     regrant_s: float = 0.5
@@ -48,6 +50,8 @@ class Grants:
         self._at = self._paced_since = self._exam_at = self._paused_at = 0.0
         self._paced_from = 0
         self._exam = NEVER
+        self._step_limit = GRANTS.step_window_ns
+        """Last tick [ns] to which an operator may step."""
 
     def begin(self) -> None:
         """Send the first grant."""
@@ -77,8 +81,10 @@ class Grants:
             self._repeat()
             return
         tick = max(exam, 0) + GRANTS.window_ns
+        self._step_limit = max(exam, 0) + GRANTS.step_window_ns
         if recorded is not None:
             tick = min(tick, recorded + GRANTS.recorder_window_ns)
+            self._step_limit = min(self._step_limit, recorded + GRANTS.recorder_window_ns)
         if self._realtime is not None:
             tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
         tick = self.horizon if self.paused else max(tick - tick % MS, self.horizon)
@@ -142,6 +148,8 @@ class Grants:
             return "continues"
         elif not 0 < ms <= GRANTS.window_ns // MS:
             raise UserError(f"step of {ms} ms: allowed are 1 to {GRANTS.window_ns // MS} ms")
+        elif self.horizon + ms * MS > self._step_limit:
+            raise UserError(f"step of {ms} ms: planning or the recorder has not finished the steps before; repeat the request")
         else:
             self._paused_at = monotonic()
             self.grant(self.horizon + ms * MS)
