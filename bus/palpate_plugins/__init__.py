@@ -144,8 +144,7 @@ class PluginKind(NamedTuple):
     def _load_file(self, choice: str) -> Callable[..., Any]:
         """Return the function of a user's file, which may import modules of its folder."""
         path = Path(choice).resolve()
-        if str(path.parent) not in sys.path:
-            sys.path.append(str(path.parent))
+        _import_from(path.parent)
         name = f"{USER_MODULE}{self.kind}"
         spec = spec_from_file_location(name, path)
         assert spec is not None
@@ -157,6 +156,29 @@ class PluginKind(NamedTuple):
             raise self.failure(choice, error) from error
         function: Callable[..., Any] = getattr(module, self.function)
         return function
+
+
+_FOLDERS: dict[Path, frozenset[str]] = {}
+"""Folders of user files, with the modules that were loaded before the first file of each: those are not forgotten."""
+
+
+def _import_from(folder: Path) -> None:
+    """Make this folder the first to import from, and forget modules of user folders that hide its own or may have changed.
+
+    The other folders stay on the path: a user's file may import a module later, inside a function.
+    """
+    _FOLDERS.setdefault(folder, frozenset(sys.modules))
+    sys.path[:] = [str(folder), *(entry for entry in sys.path if entry != str(folder))]
+    names = {path.stem for path in folder.iterdir()}
+    for name in [name for name in sys.modules if name.partition(".")[0] in names]:
+        if any(name.partition(".")[0] not in before and _comes_from(name, user) for user, before in _FOLDERS.items()):
+            del sys.modules[name]
+
+
+def _comes_from(name: str, folder: Path) -> bool:
+    """Return True if a loaded module or package is that of a folder."""
+    found, path = getattr(sys.modules[name], "__dict__", {}), str(folder.joinpath(*name.split(".")))
+    return found.get("__file__") == f"{path}.py" or path in (found.get("__path__") or ())
 
 
 IMPORTED = {"pillow": "PIL", "pin": "pinocchio", "rerun-sdk": "rerun", "scikit-learn": "sklearn"}

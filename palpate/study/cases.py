@@ -4,6 +4,7 @@ A patient's seed is a hash of study, population, split, number and salt. It does
 comparisons are paired, nor on worker and order, so that every way to run the study examines the same patients.
 """
 
+import ast
 import hashlib
 import json
 import shlex
@@ -50,7 +51,7 @@ class Case(Section):
     scenario: dict[str, Any]
     """The complete scenario, with the drawn person."""
     files: dict[str, str]
-    """SHA-256 of each file that the scenario names, by its path."""
+    """SHA-256 of each file that the scenario names, by its path (`file_hash`)."""
 
     @property
     def label(self) -> str:
@@ -220,11 +221,37 @@ def _files(scenario: Scenario) -> dict[str, str]:
 
 @cache
 def file_hash(path: str) -> str:
-    """Return the SHA-256 of a file. Raises StudyError if it cannot be read."""
+    """Return the SHA-256 of a file, of a Python file with the modules of its folder that it imports.
+
+    Raises StudyError if the file cannot be read.
+    """
     try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        own, *imported = [hashlib.sha256(file.read_bytes()).hexdigest() for file in _sources(Path(path))]
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror}") from error
+    return hashlib.sha256(canonical([own, *imported])).hexdigest() if imported else own
+
+
+def _sources(path: Path) -> list[Path]:
+    """Return a file and, if it is Python, the modules of its folder that it imports, and that these import."""
+    found = [path]
+    for file in found:
+        for name in _imported(file.read_text(encoding="utf-8", errors="replace")) if is_file(file.name) else ():
+            near = path.parent / name
+            module = near.with_suffix(".py")
+            found += [new for new in ([module] if module.is_file() else sorted(near.rglob("*.py"))) if new not in found]
+    return found
+
+
+def _imported(text: str) -> list[str]:
+    """Return the top-level names of the modules that a Python file imports, also in its functions; none if it is not Python."""
+    try:
+        nodes = list(ast.walk(ast.parse(text)))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return []
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level}
+    return sorted({name.partition(".")[0] for name in names})
 
 
 def content_id(
