@@ -42,15 +42,13 @@ _STEP = round(DT * 1e9)  # [ns]
 class PositionLoop:
     """Torques that follow position commands. Arrays have shape (n,)."""
 
-    def __init__(self, arm: Arm, q: Array, tuning: PositionLoopTuning = TUNING) -> None:
+    def __init__(self, arm: Arm, q: Array) -> None:
         """Start at rest at measured positions `q` [rad]."""
-        self._stiffness = tuning.stiffness_per_torque * arm.torque_nm
-        self._rate = tuning.settling_s * self._stiffness
+        self._stiffness = TUNING.stiffness_per_torque * arm.torque_nm
+        self._rate = TUNING.settling_s * self._stiffness
         self.damping = self._rate + DT * self._stiffness
         """Damping to take implicitly [N m s/rad]."""
-        self._limits = (arm.velocity_radps, tuning.acceleration_factor * arm.acceleration_radps2, arm.torque_nm)
-        self._frequency = tuning.reference_radps
-        self._latency, self._extrapolation = tuning.latency_ns, tuning.extrapolation_ns
+        self._limits = (arm.velocity_radps, TUNING.acceleration_factor * arm.acceleration_radps2, arm.torque_nm)
         self._goal, self._r, self._rd = q, q.copy(), np.zeros_like(q)
         self._commands = deque([(-_STEP, q)])
         """Time [ns] and positions of the command in effect and of later ones."""
@@ -69,9 +67,9 @@ class PositionLoop:
         else:
             if self._t - age > self._commands[-1][0]:
                 self._commands.append((self._t - age, command))
-            before, self._goal = self._goal, self._interpolated(self._t - self._latency)
+            before, self._goal = self._goal, self._interpolated(self._t - TUNING.latency_ns)
             error, error_rate = self._goal - self._r, (self._goal - before) / DT - self._rd
-            wanted = self._frequency**2 * error + 2 * self._frequency * error_rate
+            wanted = TUNING.reference_radps**2 * error + 2 * TUNING.reference_radps * error_rate
         self._rd = np.clip(self._rd + DT * np.clip(wanted, -acceleration, acceleration), -speed, speed)
         self._r = self._r + DT * self._rd
         if command is None:
@@ -88,4 +86,4 @@ class PositionLoop:
         (t_0, q_0), (t_1, q_1) = self._commands[0], self._commands[-1] if len(self._commands) == 1 else self._commands[1]
         if t <= t_0 or t_1 == t_0:
             return q_0
-        return np.asarray(q_0 + (min(t, t_1 + self._extrapolation) - t_0) / (t_1 - t_0) * (q_1 - q_0))
+        return np.asarray(q_0 + (min(t, t_1 + TUNING.extrapolation_ns) - t_0) / (t_1 - t_0) * (q_1 - q_0))

@@ -164,11 +164,11 @@ class Emulator(EmulatedArm):
         """Constant error of the arm's load data [N m]."""
         self._applied = Drive(self.measured, np.zeros(7))
 
-    def cycle(self, *, answered: bool = True) -> None:
+    def cycle(self) -> None:
         """Advance the arm by one send period under the newest command."""
         self.measure()
         plant, stiffness = self._plant, self._stiffness
-        self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
+        self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque())
         active = self.session.state is SessionState.COMMANDING_ACTIVE
         damping = 2 * 0.7 * np.sqrt(np.full(7, stiffness)) if active else np.full(7, BRAKE_NMS)
         error = self._load_error if active else np.zeros(7)

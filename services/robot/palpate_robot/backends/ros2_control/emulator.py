@@ -1,15 +1,15 @@
 """Emulates an arm behind ros2_control on the ROS graph: a Franka with franka_ros2 or a UR with ur_robot_driver.
 
-    python -m palpate_robot.backends.ros2_control.emulator scenario.yaml --listen tcp/127.0.0.1:7447 --event "12.5 speed 0.5"
+    python -m palpate_robot.backends.ros2_control.emulator scenario.yaml --listen tcp/127.0.0.1:7447
 
 `rules.py` lists the rules that it keeps, each with its source. The scenario names the arm (`robot.arm`) and the profile
-(`robot.driver.profile`), whose topics and conventions it has; what else `robot.driver` sets is the driver's view alone.
+(`robot.driver.profile`), whose topics and conventions it has. `ft_sign`, `ft_weight` and `ft_yaw_deg` of `robot.driver` are the
+driver's view alone; its names of topics count here too.
 """
 
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
 from itertools import count
 from typing import Any
 
@@ -38,8 +38,8 @@ log = logging.getLogger("emulator")
 class Ros2Emulator(EmulatedArm):
     """Physics and rules; call `cycle` once per period. Time comes from the caller."""
 
-    def __init__(self, known: PlantInput, profile: Profile, events: Sequence[str] = ()) -> None:
-        """Create the arm of a scenario; `events` are times [s] with events of the rules. Raises UserError."""
+    def __init__(self, known: PlantInput, profile: Profile) -> None:
+        """Create the arm of a scenario. Raises UserError."""
         if profile.stack is None:
             raise UserError("robot.driver.profile: the emulator needs a profile with a stack")
         arm = arm_of(known.robot)
@@ -53,7 +53,7 @@ class Ros2Emulator(EmulatedArm):
         self._order = [arm.joint_names.index(name) for name in self._names]
         self._model = GravityModel(known.robot)
         self._loop = PositionLoop(arm, self._joints.q) if self.rules.commands is CommandLevel.POSITION else None
-        self._events = sorted(map(_split_time, (*known.robot.driver.events, *events)))
+        self._events = sorted(map(_split_time, known.robot.driver.events))
         self._begun: int | None = None
 
     def cycle(self, now: int) -> None:
@@ -186,13 +186,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("scenario", nargs="?", default="clean", help="arm, its placement and tool, and profile")
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="change the scenario")
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint that replaces rmw_zenohd")
-    parser.add_argument("--event", action="append", default=[], metavar="TIME EVENT", help="time [s] and event of rules.py")
     given = parser.parse_args(arguments)
     logging.basicConfig(level="INFO", format="%(asctime)s emulator %(levelname)s %(message)s", stream=sys.stderr)
     try:
         known = plant_input(load_scenario(given.scenario, given.set))
         profile = profile_of(known.robot)
-        emulator = Ros2Emulator(known, profile, given.event)
+        emulator = Ros2Emulator(known, profile)
         node = RosNode("palpate_emulator", known.robot.driver.domain, BusOptions(listen=(given.listen,)))
     except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)

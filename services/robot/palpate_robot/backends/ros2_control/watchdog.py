@@ -5,12 +5,10 @@ python -m palpate_robot.backends.ros2_control.watchdog my_arm.yaml     # on the 
 
 import argparse
 import sys
-from typing import Any
 
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario
@@ -21,11 +19,6 @@ from palpate_robot.backends.watchdog import Watchdog, watch
 
 DAMPING_SHARE = 0.05
 """Share of the simulated driver's damping in a hold (assumed): it acts later than that of the driver."""
-
-
-def message(q: Array, torque: Array) -> Any:
-    """Return a command; the controller needs no positions."""
-    return array_message(torque)
 
 
 def main() -> int:
@@ -45,7 +38,7 @@ def main() -> int:
         return 2
     measured = MeasuredJoints(arm, effort_is_torque=profile.effort_is_torque)
     state, command = (profile.topic(profile.joint_states), STATE), (profile.commands(robot.level), ARRAY)
-    watch(Watchdog(measured, DAMPING_SHARE * arm.hold_damping_nms), node, state, command, message)
+    watch(Watchdog(measured, DAMPING_SHARE * arm.hold_damping_nms), node, state, command, lambda q, torque: array_message(torque))
     return 0
 
 
