@@ -94,6 +94,11 @@ def lump_covariance(lump: Bump, a: Array, b: Array, standard: PressStandard) -> 
     return np.asarray(PRIOR.lump_sd**2 * np.outer(lump(a), lump(b)) + free)
 
 
+def lump_variance(lump: Bump, xy: Array, standard: PressStandard) -> Array:
+    """Return the prior variance of a lump's log-contrast at places: the diagonal of `lump_covariance`, shape (k, 2) -> (k,)."""
+    return np.asarray((PRIOR.lump_sd * lump(xy)) ** 2 + (PRIOR.free(standard) * lump(xy, 2 * lump.edge)) ** 2)
+
+
 def error_covariances(o: Observations) -> list[Array]:
     """Return unit covariances of the fitted errors: stroke zero, breathing [m], zero of force [N], noise [1]; shape (m, m).
 
@@ -237,7 +242,7 @@ class Regression:
         last = 1.0 if anatomy is None else anatomy.bone(xy) ** 2
         prior = PRIOR.level_sd**2 + variances[:-1].sum() + variances[-1] * last
         for lump in self.lumps:
-            prior = prior + (PRIOR.lump_sd * lump(xy)) ** 2 + (PRIOR.free(o.standard) * lump(xy, 2 * lump.edge)) ** 2
+            prior = prior + lump_variance(lump, xy, o.standard)
         variance = np.maximum(prior - (whitened_cross**2).sum(axis=0), 1e-8) + self.transfer_variance
         if self.lumps and e.lump_press_sd:
             variance += (e.lump_press_sd * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
 from palpate_assessment.calibration import load_calibration
-from palpate_assessment.model import field_covariances, lump_covariance
+from palpate_assessment.model import field_covariances, lump_covariance, lump_variance
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, USUAL
 from palpate_models.numerics.frames import Array, Mask
@@ -185,7 +185,7 @@ class Posterior:
         seen = self._field[k, :n]
         mean = np.log(USUAL_N) + self._whitened[k, :n] @ seen
         variance = LEVEL_SD**2 + self._parts[k, :-1].sum() + self._parts[k, -1] * ABDOMEN.bone(self.task.places) ** 2
-        variance = variance + sum((bump(self.task.places) ** 2 for bump in self.accepted), np.zeros(1))
+        variance = variance + sum((lump_variance(bump, self.task.places, USUAL) for bump in self.accepted), np.zeros(1))
         return mean, np.maximum(variance - (seen**2).sum(axis=0), 1e-6)
 
     def unexplained(self) -> Array:

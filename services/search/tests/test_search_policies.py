@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, press_belly, suite
 from palpate_assessment.calibration import load_calibration
-from palpate_assessment.model import field_covariances
+from palpate_assessment.model import field_covariances, lump_covariance
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
 from palpate_bus.messages import ExamState, Point, SearchRequest
@@ -173,6 +173,12 @@ def test_others_are_sought_besides_an_accepted_lump() -> None:
     assert rest.lump > 0.9
     assert np.linalg.norm(rest.at[0] - (other.x, other.y)) < 0.008
     assert given(presses_of(places, SOUGHT)).accept(SOUGHT).lump < 0.3
+
+
+def test_an_accepted_lump_adds_its_prior_variance_to_the_field() -> None:
+    places = CENTRED.places
+    added = Posterior(CENTRED, (SOUGHT,)).field()[1] - Posterior(CENTRED).field()[1]
+    np.testing.assert_allclose(added, np.diag(lump_covariance(SOUGHT, places, places, USUAL)), atol=1e-12)
 
 
 def test_information_is_the_entropy_that_an_observation_takes_away() -> None:
