@@ -13,7 +13,7 @@ from palpate_bus.runtime.failure import Failure
 from palpate_bus.testing import HandInbox
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario, Services
-from palpate_plugins import PluginError
+from palpate_plugins import PluginError, PluginKind
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "threshold_assessment.py"
 
@@ -93,6 +93,22 @@ def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
     (tmp_path / "module_of_mine.py").write_text(EXAMPLE.read_text(encoding="utf-8"))
     (tmp_path / "mine.py").write_text("from module_of_mine import create\n")
     assert create("assessment", str(tmp_path / "mine.py"), load_scenario("healthy")).role == "assessment"
+
+
+def test_files_of_two_folders_import_their_own_modules_of_one_name(tmp_path: Path) -> None:
+    scan = PluginKind("patterns", "exam.pattern", "scan")
+    for folder in ("v1", "v2"):
+        (tmp_path / folder / "package_of_mine").mkdir(parents=True)
+        (tmp_path / folder / "package_of_mine" / "inner.py").write_text(f"value = '{folder}'\n")
+        (tmp_path / folder / "helper_of_mine.py").write_text(f"value = '{folder}'\n")
+        (tmp_path / folder / "later_of_mine.py").write_text(f"value = '{folder}'\n")
+        text = "import helper_of_mine\nfrom package_of_mine import inner\ndef scan():\n    import later_of_mine\n"
+        text += "    return helper_of_mine.value, inner.value, later_of_mine.value\n"
+        (tmp_path / folder / "mine.py").write_text(text)
+    for folder in ("v1", "v2", "v1"):
+        assert scan.load(str(tmp_path / folder / "mine.py"))() == (folder,) * 3
+    (tmp_path / "v1" / "helper_of_mine.py").write_text("value = 'changed'\n")
+    assert scan.load(str(tmp_path / "v1" / "mine.py"))() == ("changed", "v1", "v1")
 
 
 def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from synthetic import TOY, study
 
-from palpate.study.cases import Case, Request, cases_of, command_of, patient_seeds, secret_of
+from palpate.study.cases import Case, Request, cases_of, command_of, file_hash, patient_seeds, secret_of
 from palpate.study.folder import SESSIONS, Folder, Outcome, Session, manifest_of, merge
 from palpate.study.spec import Grid, Lumps, Study, StudyError, load_study, study_names
 
@@ -128,6 +128,20 @@ def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, 
         settings = {"exam.pattern": "search"} if field == "search.policy" else {}
         found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
     assert found[0] == found[1] != found[2]
+
+
+def test_the_hash_of_a_python_file_includes_the_modules_of_its_folder_that_it_imports(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    (tmp_path / "mine.py").write_text("def create(scenario):\n    import helper\n")
+    (tmp_path / "helper.py").write_text("from package.inner import value\n")
+    found = []
+    for changed in ("package/inner.py", "helper.py", "not_imported.py"):
+        with (tmp_path / changed).open("a") as file:
+            file.write("# changed\n")
+        found.append(file_hash.__wrapped__(str(tmp_path / "mine.py")))
+    assert found[0] != found[1] == found[2]
+    (tmp_path / "package" / "inner.py").write_text("value = 2\n")
+    assert file_hash.__wrapped__(str(tmp_path / "mine.py")) != found[2]
 
 
 def test_the_command_states_every_option() -> None:
