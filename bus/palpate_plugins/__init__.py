@@ -167,12 +167,12 @@ def _import_from(folder: Path) -> None:
 
     The other folders stay on the path: a user's file may import a module later, inside a function.
     """
-    _FOLDERS.setdefault(folder, frozenset(sys.modules))
     sys.path[:] = [str(folder), *(entry for entry in sys.path if entry != str(folder))]
     names = {path.stem for path in folder.iterdir()}
     for name in [name for name in sys.modules if name.partition(".")[0] in names]:
         if any(name.partition(".")[0] not in before and _comes_from(name, user) for user, before in _FOLDERS.items()):
             del sys.modules[name]
+    _FOLDERS.setdefault(folder, frozenset(sys.modules))
 
 
 def _comes_from(name: str, folder: Path) -> bool:
