@@ -65,9 +65,12 @@ def run_distributed(
         for group in groups:
             if mine := [processes[role] for role in group if role not in absent.roles]:
                 local.start(*mine)
-        others = (*absent.roles, *(REPLACEABLE if timing.handover_s else ()))
-        free = {role: process for role, process in processes.items() if role in others}
-        places = {role: ServicePlace(one.command, local.environment(one), role in absent.roles) for role, one in free.items()}
+        kept = REPLACEABLE if timing.handover_s else frozenset()
+        places = {
+            role: ServicePlace(one.command, local.environment(one), role in absent.roles, role in kept)
+            for role, one in processes.items()
+            if role in absent.roles or role in kept
+        }
         if places:
             write_places(out, places)
         start_s, step_s = Settings.read().start_limit_s, Settings.read().step_limit_s

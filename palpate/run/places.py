@@ -37,7 +37,9 @@ class ServicePlace(NamedTuple):
     environment: Mapping[str, str]
     """Added to the environment of the user."""
     awaited: bool
-    """True if the run left it out; else its slot is kept when it stops."""
+    """True if the run left it out."""
+    kept: bool
+    """True if its slot is kept when it stops."""
 
 
 @dataclass
@@ -89,7 +91,8 @@ def read_places(run: Run) -> dict[str, ServicePlace]:
     """Return the places of a run; none if it started all services itself and keeps no slot."""
     file = Path(run.out) / FILE
     rows = read_json(file) if file.is_file() else {}
-    return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
+    names = ServicePlace._fields[1:]
+    return {role: ServicePlace(tuple(row["command"]), *(row[name] for name in names)) for role, row in rows.items()}
 
 
 def place_to_join(role: str, run: Run) -> ServicePlace:
@@ -108,7 +111,7 @@ def place_to_take(role: str, run: Run) -> ServicePlace:
         raise UserError(f"{role}: only {', '.join(sorted(REPLACEABLE))} can change hands in a run; without the others it ends")
     if run.runtime != "wallclock":
         raise UserError(f"run {run.name} is in {run.runtime}: services change hands in wall-clock runs only")
-    kept = {name: place for name, place in read_places(run).items() if not place.awaited}
+    kept = {name: place for name, place in read_places(run).items() if place.kept}
     if role not in kept:
         raise UserError(f"run {run.name} keeps no places: start it with `palpate run --wallclock --handover 60`")
     others = tuple(endpoint for name, endpoint in run.endpoints.items() if name != role)

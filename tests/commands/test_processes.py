@@ -204,7 +204,7 @@ def test_a_stopped_process_is_continued_at_the_end_and_closes_its_files(local: L
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
 COMMAND = service.command("control")
-PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
+PLACE = ServicePlace(COMMAND, ENVIRONMENT, True, False)
 
 
 def run(folder: Path, runtime: str = "lockstep") -> Run:
@@ -243,7 +243,10 @@ def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> N
         place_to_take("camera", run(tmp_path))
     with pytest.raises(UserError, match="--handover 60"):
         place_to_take("camera", run(tmp_path, "wallclock"))
-    write_places(tmp_path, {"camera": PLACE._replace(awaited=False)})
+    write_places(tmp_path, {"camera": PLACE})
+    with pytest.raises(UserError, match="--handover 60"):
+        place_to_take("camera", run(tmp_path, "wallclock"))
+    write_places(tmp_path, {"camera": PLACE._replace(kept=True)})  # left out at the start, and replaced later
     environment = place_to_take("camera", run(tmp_path, "wallclock")).environment
     assert environment["PALPATE_SCENARIO"] == ENVIRONMENT["PALPATE_SCENARIO"]
     assert environment["PALPATE_LISTEN"] == ""
