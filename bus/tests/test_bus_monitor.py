@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from toy_services import joint_state, torque_command, wrench
 from palpate_bus import messages as msg
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
-from palpate_bus.messages import MS, codec, header
+from palpate_bus.messages import MS, UNIX_NS, RunControl, codec, header
 from palpate_bus.messages.fields import leaves, numbers
 from palpate_bus.monitor.health import RECENT_S, TopicHealth, Violation, topic_statuses
-from palpate_bus.monitor.monitor import Monitor
+from palpate_bus.monitor.monitor import LiveMonitor, Monitor
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
+from palpate_bus.wire.zenoh_config import BusOptions, session
 
 RULES = contract()
 LOOK_MS = 50
@@ -260,3 +262,16 @@ def test_every_number_out_of_range_or_not_finite_is_named(name: str, data: st.Da
             if not np.all(np.isfinite(values) & (values >= least) & (values <= most)):
                 wrong.add(row)
     assert {found.field for found in Checker(topic)(message) if found.kind not in (Kind.FRAME, Kind.NORM)} == wrong
+
+
+def test_a_run_in_wall_clock_mode_is_judged_at_the_rate_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_RATE", "0.25")
+    start = codec.encode(RunControl(RunControl.GRANT, UNIX_NS, False, "", ""), "palpation_msgs/msg/RunControl")
+    received = iter([SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: start)), None])
+    with session(BusOptions()) as bus:
+        watching = LiveMonitor(bus, RULES, 0, ("clock",))
+        watching._control.undeclare()
+        watching._control = SimpleNamespace(handler=SimpleNamespace(try_recv=received.__next__), undeclare=lambda: None)
+        watching._receive_control()
+        watching.close()
+    assert watching.monitor.rate == 0.25

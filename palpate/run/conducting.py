@@ -12,6 +12,7 @@ from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
 from palpate_bus.runs.run_folder import LOCK, in_use
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
@@ -37,7 +38,7 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     roles = (*workers(chosen), *observers)
     with results_first(), lock_output(out):
         with RunDisplay(console, quiet, chosen.exam) as display:
-            timing = Timing(wallclock, 1.0 if realtime else None)
+            timing = Timing(wallclock, 1.0 if realtime else None, Settings.read().rate or 1.0)
             result = conduct(session, roles, display.show, timing=timing, tree=FrameTree(exam_input(chosen)))
         all_is_measured()
         close_session(session)

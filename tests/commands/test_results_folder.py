@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 import typer
@@ -19,6 +20,7 @@ from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
+from palpate.run import conducting
 from palpate.run.conducting import conduct_others
 from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
@@ -99,6 +101,14 @@ def test_a_killed_run_is_not_conducted_over(tmp_path: Path) -> None:
     (tmp_path / LOCK).write_text("1")  # as a kill leaves it
     with pytest.raises(UserError, match="it holds the results of a run"):
         conduct_others(tmp_path, (), realtime=False, wallclock=False, quiet=True)
+
+
+def test_others_are_conducted_at_the_rate_of_their_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_scenario_files(load_scenario("clean"), tmp_path)
+    monkeypatch.setenv("PALPATE_RATE", "0.25")
+    with mock.patch.object(conducting, "conduct", side_effect=UserError("enough")) as conduct, pytest.raises(UserError):
+        conduct_others(tmp_path, (), realtime=False, wallclock=True, quiet=True)
+    assert conduct.call_args.kwargs["timing"].wallclock_rate == 0.25
 
 
 def test_a_command_on_a_full_disk_is_not_refused() -> None:

@@ -25,6 +25,7 @@ from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import MS, UNIX_NS, RunControl, ServiceReport, codec
 from palpate_bus.monitor import health
 from palpate_bus.monitor.health import BusTime, SeenViolation, Stream, TopicHealth, Violation
+from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
 from palpate_bus.wire.transport import subscribe, try_decode
@@ -301,7 +302,7 @@ class LiveMonitor:
     def _receive_control(self) -> None:
         for message in _decode(self._control, self._decode_control):
             if message.command == RunControl.GRANT and message.tick >= UNIX_NS:  # the common start of a wall-clock run
-                self.monitor.rate = self.monitor.rate or 1.0
+                self.monitor.rate = self.monitor.rate or Settings.read().rate or 1.0
 
     def _receive_reports(self, now: float) -> None:
         for message in _decode(self._reports, self._decode_report):
