@@ -33,10 +33,9 @@ class Violation(NamedTuple):
 
 @dataclass
 class SeenViolation:
-    """A violation with its count and times of first and last occurrence, by the caller's clock [s]."""
+    """A violation with its count and the time of its last occurrence, by the caller's clock [s]."""
 
     violation: Violation
-    first: float
     last: float
     count: int = 1
 

@@ -187,7 +187,7 @@ class Monitor:
             seen = self.active[key]
             seen.violation, seen.last, seen.count = violation, now, seen.count + 1
         else:
-            self.active[key] = SeenViolation(violation, now, now)
+            self.active[key] = SeenViolation(violation, now)
             self._news.append(violation)
 
     def _check_sequence(self, topic: Topic, stream: Stream, sequence: int, now: float) -> None:
