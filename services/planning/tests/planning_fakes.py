@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck
-from palpate_bus.messages.codes import Phase
+from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr
@@ -20,7 +20,8 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
-from palpate_planning.status import ArmStop, ExamStep, Observation
+from palpate_planning.status import ArmStop, ExamStatus, ExamStep, Observation
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
@@ -31,6 +32,8 @@ PERIOD_S = PERIOD / SECOND
 
 BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 """Placement from which the regions of the tests are in reach."""
+SMALL = {"region_m": (0.025, 0.0125)}
+"""Two lines of three targets."""
 
 
 def known(robot: Robot = BASE, **exam: object) -> ExamInput:
@@ -55,21 +58,16 @@ def grid_mesh(half: tuple[float, float], step: float = 0.006) -> tuple[Array, ND
 
 def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
     """Return surface and targets in snake or raster order from an ideal perception; the whole surface moves with the breath."""
-    X_WA = np.array(settings.X_WA)
-    exam = settings.exam
-    half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
-    vertices, triangles = grid_mesh(half)
+    X_WA, exam = np.array(settings.X_WA), settings.exam
+    half = np.array(exam.region_m) / 2
+    vertices, triangles = grid_mesh((half[0] + 0.04, half[1] + 0.04))
     p_W = apply(X_WA, vertices)
     surface = PerceivedSurface.from_mesh(p_W, None, X_WA, np.ones(len(p_W)))
-    nx, ny = (round(size / exam.spacing_m) + 1 for size in exam.region_m)
-    xy, lines = [], []
-    for j, y in enumerate(np.linspace(-exam.region_m[1] / 2, exam.region_m[1] / 2, ny)):
-        x = np.linspace(-exam.region_m[0] / 2, exam.region_m[0] / 2, nx)
-        for value in x[:: -1 if exam.pattern != "raster" and j % 2 else 1]:
-            xy.append((value, y))
-            lines.append(j)
+    x, y = (np.linspace(-h, h, round(2 * h / exam.spacing_m) + 1) for h in half)
+    turns = exam.pattern != "raster"
+    xy = [(value, row) for j, row in enumerate(y) for value in x[:: -1 if turns and j % 2 else 1]]
     points, _ = surface.at(np.array(xy))
-    return PerceivedAbdomen(points, np.array(lines), p_W, triangles, surface)
+    return PerceivedAbdomen(points, np.repeat(np.arange(len(y)), len(x)), p_W, triangles, surface)
 
 
 def hertz(newton_at_10mm: float) -> Callable[[float], float]:
@@ -116,13 +114,32 @@ class World:
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | Cause] = [self.dome]
-        self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, NO_CAUSE
+        self.stop, self.soft, self.end_request, self.lost = NO_CAUSE, False, NO_CAUSE, NO_CAUSE
         self.final = False
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None
         self._q_before, self._velocity = self.q, np.zeros(3)
         self._touch(self.kinematics.pose(self.q))
+
+    @property
+    def status(self) -> ExamStatus:
+        """Return what the examination reports."""
+        return self.exam.status
+
+    @property
+    def end(self) -> tuple[Phase, Reason]:
+        """Return phase and reason."""
+        return self.status.phase, self.status.cause.reason
+
+    @property
+    def p_W(self) -> Array:
+        """Return where the indenter is [m], shape (3,)."""
+        return self.kinematics.pose(self.q)[:3, 3]
+
+    def depth_error(self) -> float:
+        """Return the RMS error of the true depth while samples count [m]."""
+        return float(np.sqrt(np.mean([(row[4] - self.settings.exam.depth_m) ** 2 for row in self.rows if row[1]])))
 
     def _touch(self, X_WI: Array) -> Array:
         """Contact force on the tool at a pose, world axes; sets true depth and force."""
@@ -142,12 +159,10 @@ class World:
             X = self.kinematics.pose(self.q)
             pull = setpoint.F_W[:3] + self._touch(X)
             sag = setpoint.R_WD @ ((setpoint.R_WD.T @ pull) / CARTESIAN_STIFFNESS[:3])
-            gap = setpoint.p_WD + sag - X[:3, 3]
             R = setpoint.R_WD @ X[:3, :3].T  # without np.cross, which takes as long as the rest
             turn = np.array((R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])) / 2
-            J = self.kinematics.jacobian(self.q)
-            posture = setpoint.q - self.q
-            task = np.concatenate((gap, turn)) - J @ posture
+            J, posture = self.kinematics.jacobian(self.q), setpoint.q - self.q
+            task = np.concatenate((setpoint.p_WD + sag - X[:3, 3], turn)) - J @ posture
             self.q = self.q + 0.4 * (J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(6), task) + posture)
 
     def step(self) -> ExamStep:
@@ -166,10 +181,9 @@ class World:
         final = self.exam.status.phase is Phase.ASSESS
         reading = SensorReading(self.t, self.q.copy(), wrench, qd)
         motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
-        outcome = self.exam.step(
-            Observation(self.t, reading, answer, motion, final, ArmStop(self.stop, self.soft, self.final), self.end, self.lost)
-        )
-        self.end = NO_CAUSE
+        stop = ArmStop(self.stop, self.soft, self.final)
+        outcome = self.exam.step(Observation(self.t, reading, answer, motion, final, stop, self.end_request, self.lost))
+        self.end_request = NO_CAUSE
         if outcome.trigger:
             self._answer_at, self.moved = self.t + 300 * MS, False
         status = self.exam.status
@@ -189,10 +203,30 @@ class World:
         seen = not self.hides(self.kinematics.pose(self.q)[:3, 3])
         return BreathObservation(stamp, forecast, 3e-4, self.calm and seen, self.moved, self.shift_A, seen)
 
+    def steps(self, count: int) -> None:
+        """Run some planning periods."""
+        for _ in range(count):
+            self.step()
+
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
         """Step until the exam has ended (or `until`), at most `seconds` of simulated time."""
-        ended = until or (lambda: self.exam.status.end_tick >= 0)
+        ended = until or (lambda: self.status.end_tick >= 0)
         while not ended():
             if self.t > seconds * SECOND:
-                raise AssertionError(f"not there after {seconds} s: {self.exam.status}")
+                raise AssertionError(f"not there after {seconds} s: {self.status}")
             self.step()
+
+    def run_to(self, phase: Phase) -> None:
+        """Step until a phase begins."""
+        self.run(lambda: self.status.phase is phase)
+
+    def reach(self, stage: StrokeStage, stroke: int) -> float:
+        """Step until a stage of a stroke begins; return the time [s]."""
+        self.run(lambda: self.status.stroke >= stroke and self.status.message == stage.value)
+        return self.t / SECOND
+
+    def complete(self, seconds: float = 120.0) -> None:
+        """Step to the end of an examination that leaves out no target."""
+        self.run(seconds=seconds)
+        assert self.status.phase is Phase.DONE, self.status.message
+        assert self.status.targets_skipped == 0

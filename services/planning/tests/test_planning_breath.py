@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import World, known
+from planning_fakes import SMALL, World, known
 
 from palpate_bus.messages import SurfaceMotion
 from palpate_bus.messages.codes import Phase, Reason
@@ -13,6 +13,7 @@ from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import Cause
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen, nearest_targets
 from palpate_planning.waits import Tally
 from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
@@ -24,44 +25,44 @@ def motion(stamp: int, *forecast: float, calm: bool = True, moved: bool = False)
     return BreathObservation(stamp, np.array(forecast), 3e-4, calm, moved)
 
 
+def received(*motions: BreathObservation, late: int = 100 * MS) -> Breath:
+    """Return a breath that received each message `late` [ns] after its exposure."""
+    breath = Breath()
+    for one in motions:
+        breath.receive(one, one.stamp + late)
+    return breath
+
+
 def breathing(t_s: float) -> float:
     """8 mm peak to peak, 14 a minute [m]."""
     return 0.004 * (1 - float(np.cos(2 * np.pi * 14 / 60 * t_s)))
 
 
 def test_in_between_the_forecast_is_interpolated() -> None:
-    breath = Breath()
-    breath.receive(motion(SECOND, 0.0, 0.001, 0.003), SECOND + 100 * MS)
+    breath = received(motion(SECOND, 0.0, 0.001, 0.003))
     assert breath.displacement(SECOND + 75 * MS) == pytest.approx(0.002)
     assert breath.displacement(3 * SECOND) == pytest.approx(0.003)
 
 
 def test_a_new_forecast_is_joined_without_a_step() -> None:
-    breath = Breath()
-    breath.receive(motion(0, 0.002, 0.002), 100 * MS)
-    breath.receive(motion(100 * MS, 0.004, 0.004), 200 * MS)
+    breath = received(motion(0, 0.002, 0.002), motion(100 * MS, 0.004, 0.004))
     assert breath.displacement(200 * MS) == pytest.approx(0.002)
     assert breath.displacement(200 * MS + round(TUNING.join_s * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
 
 
 @pytest.mark.parametrize(("wall_m", "left_m"), [(-0.030, 0.026), (0.030, 0.030 * float(np.exp(-4 / 3)))])
 def test_a_wall_that_leaps_inward_is_followed_slowly_and_outward_at_once(wall_m: float, left_m: float) -> None:
-    breath = Breath()
-    breath.receive(motion(0, 0.0, 0.0), 0)
-    breath.receive(motion(100 * MS, wall_m, wall_m), 100 * MS)
+    breath = received(motion(0, 0.0, 0.0), motion(100 * MS, wall_m, wall_m), late=0)
     assert abs(breath.displacement(140 * MS) - wall_m) == pytest.approx(left_m)
 
 
 def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
-    breath = Breath()
-    breath.receive(motion(0, 0.0, 0.0), 0)
-    assert breath.calm(400 * MS)
-    assert not breath.calm(600 * MS)
+    breath = received(motion(0, 0.0, 0.0), late=0)
+    assert [breath.calm(t * MS) for t in (400, 600)] == [True, False]
 
 
 def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
-    breath = Breath()
-    watch = WallWatch(breath, Following.FOLLOW, DT, Tally())
+    watch = WallWatch(breath := Breath(), Following.FOLLOW, DT, Tally())
     breath.receive(motion(0, 0.0, calm=False), 0)
     watch.step(0, contact_lost=False)
     assert watch.spoiled and not watch.calm
@@ -85,8 +86,7 @@ def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
 
 
 def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> None:
-    breath = Breath()
-    watch = WallWatch(breath, Following.FOLLOW, DT, Tally())
+    watch = WallWatch(breath := Breath(), Following.FOLLOW, DT, Tally())
     breath.receive(motion(0, 0.0, calm=False)._replace(seen=False), 0)
     for leaving, hidden in ((True, False), (False, True), (True, False)):
         for _ in range(round(1.1 * WALL.hidden_timeout_s / DT)):
@@ -95,68 +95,46 @@ def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> N
 
 
 def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
-    breath = Breath()
-    watch = WallWatch(breath, Following.GATE, DT, Tally())
+    watch = WallWatch(breath := Breath(), Following.GATE, DT, Tally())
     for displacement, open_ in ((0.0, True), (0.006, False)):
         breath.receive(motion(0, displacement), 0)
         watch.step(SECOND, contact_lost=False)
         assert watch.open is open_
 
 
-@pytest.mark.parametrize(("following", "most"), [("follow", 6e-4), ("gate", 6e-4)])
-def test_a_breathing_wall_is_palpated_at_the_requested_depth(following: str, most: float) -> None:
-    world = World(known(region_m=(0.025, 0.0125), breathing=following), offset=0.006, excursion=breathing)
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    steady = np.array([row[4] for row in world.rows if row[1]])
-    assert len(steady) > 100
-    assert np.sqrt(np.mean((steady - 0.010) ** 2)) < most
+@pytest.mark.parametrize("following", ["follow", "gate"])
+def test_a_breathing_wall_is_palpated_at_the_requested_depth(following: str) -> None:
+    world = World(known(breathing=following, **SMALL), offset=0.006, excursion=breathing)
+    world.complete()
+    assert sum(row[1] for row in world.rows) > 100
+    assert world.depth_error() < 6e-4
 
 
-def test_a_part_disturbed_by_a_cough_is_repeated() -> None:
-    world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
-    world.run(lambda: world.exam.status.phase is Phase.SCAN)
-    for _ in range(30):
-        world.step()
-    stroke = world.exam.status.stroke
-    world.calm = False
-    for _ in range(100):
-        world.step()
-    assert world.pressed == 0.0
-    assert not world.exam.status.steady
-    world.calm = True
-    world.run(lambda: world.exam.status.phase is Phase.SCAN)
-    assert world.exam.status.stroke == stroke + 1
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    assert world.exam.status.targets_skipped == 0
-
-
-def test_coughs_in_one_place_cost_no_target() -> None:
-    world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
+def test_a_part_disturbed_by_coughs_is_repeated_until_it_is_felt() -> None:
+    world, strokes = World(known(region_m=(0.05, 0.0125)), excursion=breathing), []
     for _ in range(2 * RECOVERY.repeats_max):
-        world.run(lambda: world.exam.status.phase is Phase.SCAN)
+        world.run_to(Phase.SCAN)
+        strokes.append(world.status.stroke)
         world.calm = False
-        for _ in range(100):
-            world.step()
+        world.steps(100)
+        assert world.pressed == 0.0
+        assert not world.status.steady
         world.calm = True
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    assert not world.exam.skipped
+    assert np.diff(strokes).tolist() == [1] * (len(strokes) - 1)
+    world.complete()
 
 
 def test_the_rest_of_an_abandoned_stroke_is_passed_above_the_skin() -> None:
     """The next motion starts at the end of the stroke, and the set-point must not jump there."""
     world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
     for _ in range(RECOVERY.repeats_max + 1):
-        world.run(lambda: world.exam.status.phase is Phase.SCAN)
-        for _ in range(10):
-            world.step()
+        world.run_to(Phase.SCAN)
+        world.steps(10)
         felt, world.force = world.force, lambda depth: 0.0  # contact is lost
-        world.run(lambda: world.exam.status.phase is not Phase.SCAN)
+        world.run(lambda: world.status.phase is not Phase.SCAN)
         world.force = felt
     world.run()
-    assert world.exam.status.phase is Phase.ABORTED, "more than a tenth of the targets is lost"
+    assert world.status.phase is Phase.ABORTED, "more than a tenth of the targets is lost"
     assert {cause.reason for cause in world.exam.skipped.values()} == {Reason.WALL_NOT_TRACKED}
     there = [pair for pair in pairwise(world.setpoints) if all(s.mode is ControlMode.CARTESIAN for s in pair)]
     assert max(float(np.linalg.norm(b.p_WD - a.p_WD)) for a, b in there) < 0.005
@@ -166,36 +144,29 @@ def moved_in_the_second_stroke(*answers: PerceivedAbdomen | Cause) -> World:
     """Return an examination within a second of detected patient motion; later scans have these answers."""
     world = World(known(region_m=(0.025, 0.025)), excursion=breathing)
     world.answers += answers
-    for _ in range(2):
-        world.run(lambda: world.exam.status.phase is Phase.SCAN)
-        world.run(lambda: world.exam.status.phase is not Phase.SCAN)
-    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    world.reach(StrokeStage.SLIDE, 3)
     world.moved = True
-    for _ in range(100):
-        world.step()
+    world.steps(100)
     assert world.depth < -0.008
-    assert world.exam.status.patient_moved
+    assert world.status.patient_moved
     return world
 
 
 def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     world = moved_in_the_second_stroke()
-    strokes, first = world.exam.status.stroke, world.exam._course.palpation
-    assert world.exam.status.phase is Phase.LOOK
+    strokes, first = world.status.stroke, world.exam._course.palpation
+    assert world.status.phase is Phase.LOOK
     world.shift_A = (0.008, -0.003)
-    world.run(lambda: world.exam.status.phase is Phase.SCAN)
-    status = world.exam.status
-    assert status.stroke > strokes
-    assert not status.patient_moved
+    world.run_to(Phase.SCAN)
+    assert world.status.stroke > strokes
+    assert not world.status.patient_moved
     second = world.exam._course.palpation
     assert first is not None and second is not None
     assert second.recovery.tally is first.recovery.tally, "a new plan does not renew the limits"
-    foot = world.exam._course.contact.foot
-    place = world.exam._sense.wall.perceived.xy(world.exam._course.contact.wall_point[0])
-    assert place == pytest.approx(foot.xy_A - (0.008, -0.003), abs=5e-4)
-    world.run()
-    assert status.phase is Phase.DONE
-    assert status.targets_skipped == 0
+    contact = world.exam._course.contact
+    place = world.exam._sense.wall.perceived.xy(contact.wall_point[0])
+    assert place == pytest.approx(contact.foot.xy_A - (0.008, -0.003), abs=5e-4)
+    world.complete()
 
 
 def test_targets_of_a_new_scan_are_known_by_their_places() -> None:
@@ -207,25 +178,19 @@ def test_targets_of_a_new_scan_are_known_by_their_places() -> None:
 def test_a_patient_who_moved_out_of_view_is_assessed_from_the_samples_before() -> None:
     world = moved_in_the_second_stroke(Cause(Reason.VIEW_FAILED, "a curtain"))
     world.run()
-    status = world.exam.status
-    assert status.phase is Phase.DONE
-    assert 0 < status.targets_skipped < status.target_count
+    assert world.status.phase is Phase.DONE
+    assert 0 < world.status.targets_skipped < world.status.target_count
     assert world.exam.skipped.popitem()[1].reason is Reason.PATIENT_MOVED
 
 
 def test_measured_displacements_cover_the_past_only() -> None:
-    breath = Breath()
-    breath.receive(motion(SECOND, 0.001, 0.0), SECOND + 100 * MS)
-    breath.receive(motion(SECOND + 100 * MS, 0.003, 0.0), SECOND + 200 * MS)
+    breath = received(motion(SECOND, 0.001, 0.0), motion(SECOND + 100 * MS, 0.003, 0.0))
     assert breath.measured_at(np.array([SECOND, SECOND + 50 * MS])) == pytest.approx([0.001, 0.002])
     assert breath.measured_at(np.array([SECOND, SECOND + 150 * MS])) is None
 
 
 def test_uncertainty_grows_with_age_and_previous_errors_of_forecasts() -> None:
-    good, bad = Breath(), Breath()
-    for k in range(10):
-        for breath, step in ((good, 0.0), (bad, 5e-4)):
-            breath.receive(motion(k * 100 * MS, *[(-1) ** k * step] * 11), (k + 1) * 100 * MS)
+    good, bad = (received(*(motion(k * 100 * MS, *[(-1) ** k * step] * 11) for k in range(10))) for step in (0.0, 5e-4))
     t = SECOND + 50 * MS
     assert good.uncertainty(t) == pytest.approx(3e-4)
     assert bad.uncertainty(t) > 5e-4
@@ -238,7 +203,4 @@ def test_the_forecast_is_read_at_the_times_that_the_message_says() -> None:
 
 def test_lifting_ends_with_a_changing_uncertainty_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Breath, "uncertainty", lambda breath, t: 0.003 + 0.001 * np.sin(t / 37_000_000))
-    world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    assert world.exam.status.targets_skipped == 0
+    World(known(**SMALL), excursion=breathing).complete()

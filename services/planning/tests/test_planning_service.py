@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, World, known
+from planning_fakes import BASE, SMALL, World, known
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
@@ -26,10 +26,11 @@ from palpate_bus.messages.geometry import mesh_message, point_message, wrench_me
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
-from palpate_models.scenario.schema import Exam, Scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_planning.service import PlanningService, create
 from palpate_planning.status import ExamStep
 
+HOME = np.array(lbr.HOME)
 OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
 
 
@@ -55,15 +56,13 @@ class BusWorld(World):
     """The closed loop with messages between world and service."""
 
     def __init__(self) -> None:
-        settings = known(region_m=(0.025, 0.0125))
+        settings = known(**SMALL)
         super().__init__(settings)
         self.service = PlanningService(settings)
         self.exam = self.service._exam
         self.inbox = HandInbox()
-        self.seen: Callable[[Any], None] = lambda surface: None
-        """Change of a perceived surface on the bus."""
-        self.targets: Callable[[Any], None] = lambda targets: None
-        """Change of the targets on the bus."""
+        self.damage: Callable[[Any, Any], None] = lambda surface, targets: None
+        """Change of a perceived surface and of the targets on the bus."""
         self.states: list[Any] = []
         self.events: list[str] = []
 
@@ -76,16 +75,13 @@ class BusWorld(World):
         inbox.put("robot/status", status(t, self.q, w))
         if self._answer_at is not None and t >= self._answer_at:
             self._answer_at = None
-            mesh, found = self.dome, self.dome.positions
-            surface = mesh_message(header(t, "world"), mesh.vertices, triangles=mesh.triangles)
-            self.seen(surface)
-            inbox.put("perception/surface", surface)
-            normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
-            points, lines = [point_message(p) for p in found], np.asarray(mesh.lines, dtype=np.uint32)
+            surface = mesh_message(header(t, "world"), self.dome.vertices, triangles=self.dome.triangles)
+            points, lines = [point_message(p) for p in self.dome.positions], np.asarray(self.dome.lines, dtype=np.uint32)
+            normals = [Vector3(0.0, 0.0, 1.0)] * len(points)
             targets = PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, 0, "")
-            self.targets(targets)
-            inbox.put("perception/targets", targets)
-        if self.exam.status.phase is Phase.ASSESS:
+            self.damage(surface, targets)
+            inbox.put("perception/surface", surface).put("perception/targets", targets)
+        if self.status.phase is Phase.ASSESS:
             inbox.put("assessment/findings", Findings(header(t, "abdomen"), [], [], True))
         out = sent(self.service.step(t, inbox))
         self.states.append(out["exam/state"])
@@ -103,8 +99,7 @@ class BusWorld(World):
 
 def test_an_examination_over_messages() -> None:
     world = BusWorld()
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
+    world.complete()
     assert world.events == ["planning/camera_trigger", "planning/path"] + 3 * ["exam/touches"] + ["exam/correction"]
     assert [s.phase for s in world.states if s.end_tick >= 0] == [Phase.DONE]
     steady = [s for s in world.states if s.steady]
@@ -113,33 +108,20 @@ def test_an_examination_over_messages() -> None:
     assert [s.depth for s in steady] == pytest.approx([0.010] * len(steady), abs=1e-3)
     assert [s.normal_force for s in steady] == pytest.approx([2.4] * len(steady), rel=0.1)
     facts = world.service.finish()
-    assert facts["phase"] == "DONE"
-    assert facts["skipped_targets"] == {}
+    assert (facts["phase"], facts["skipped_targets"]) == ("DONE", {})
     assert facts["peak_force_N"] < 4.0
 
 
-def test_the_first_step_sends_no_setpoint() -> None:
-    service = create(Scenario(robot=BASE, exam=Exam()))
-    out = sent(service.step(0, HandInbox()))
+def test_the_first_step_asks_the_arm_for_nothing() -> None:
+    out = sent(create(Scenario(robot=BASE)).step(0, HandInbox()))
     assert out["planning/setpoint"].mode == ControlMode.JOINT
     assert not np.any(out["planning/setpoint"].joint_stiffness)
     assert nanoseconds(out["planning/setpoint"].valid_for) == contract().topics["planning/setpoint"].expiry
-    assert out["exam/state"].phase == Phase.HOME
-    assert out["exam/state"].end_tick == -1
-
-
-def test_the_arm_is_held_where_it_was_found() -> None:
-    service = create(Scenario(robot=BASE))
-    inbox = HandInbox()
-    q = np.array(lbr.HOME) + 0.2
-    inbox.put("robot/status", status(0, q, np.zeros(6)))
-    out = sent(service.step(0, inbox))
-    assert np.array(out["planning/setpoint"].joint_position) == pytest.approx(q, abs=1e-12)
-    assert np.all(out["planning/setpoint"].joint_stiffness > 0)
+    assert (out["exam/state"].phase, out["exam/state"].end_tick) == (Phase.HOME, -1)
 
 
 def idle(reason: str, mode: int = RobotStatus.MODE_IDLE) -> Any:
-    return status(10 * MS, np.array(lbr.HOME), np.zeros(6), mode, reason)
+    return status(10 * MS, HOME, np.zeros(6), mode, reason)
 
 
 SOFT_STOP = SupervisorState(header(10 * MS), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "", 9.0)
@@ -155,14 +137,13 @@ CAUSES = {
 def after(topic: str, message: Any) -> Any:
     """Return the state of an examination under way after a message, or after the loss of a role if there is none."""
     service, inbox = create(Scenario(robot=BASE)), HandInbox()
-    inbox.put("robot/status", status(0, np.array(lbr.HOME), np.zeros(6)))
+    inbox.put("robot/status", status(0, HOME, np.zeros(6)))
     for t in (0, 10 * MS):
         service.step(t, inbox)
-    inbox.events = {}
     if message is None:
         inbox.gone.add(topic)
     else:
-        inbox.put(topic, message, 10 * MS)
+        inbox.receive({topic: message})
     return sent(service.step(20 * MS, inbox))["exam/state"]
 
 
@@ -181,13 +162,13 @@ def test_a_lost_robot_aborts() -> None:
 def test_a_damaged_surface_and_coincident_targets_cause_a_new_scan(coincident: bool) -> None:
     world, looks = BusWorld(), []
 
-    def damage(message: Any) -> None:
-        looks.append(message)
+    def damage(surface: Any, targets: Any) -> None:
+        looks.append(surface)
         if len(looks) == 1 and coincident:
-            message.positions[1] = message.positions[0]
+            targets.positions[1] = targets.positions[0]
         elif len(looks) == 1:
-            message.triangles[7] = 4294967269
+            surface.triangles[7] = 4294967269
 
-    setattr(world, "targets" if coincident else "seen", damage)
-    world.run(lambda: world.exam.status.phase is Phase.INDENT)
+    world.damage = damage
+    world.run_to(Phase.INDENT)
     assert len(looks) == 2
