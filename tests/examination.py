@@ -51,14 +51,8 @@ def command(scenario: str, folder: Path, *options: str, settings: tuple[str, ...
 def palpate_run(scenario: str, folder: Path, *options: str, settings: tuple[str, ...] = (), timeout: float = 900) -> Finished:
     """Run an examination to its end."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        command(scenario, folder, *options, settings=settings),
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        env=environment,
-        check=False,
-    )
+    words = command(scenario, folder, *options, settings=settings)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, env=environment, check=False)
     return Finished(done.returncode, done.stdout + done.stderr, folder)
 
 
@@ -87,22 +81,20 @@ class Killed:
 
 
 def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
-    words = command(
-        "clean", folder, *options, settings=(*SHORT, "exam.region_m=[0.06, 0.03]", "camera.frames=4", "phantom.edge_m=0.01")
-    )
+    settings = (*SHORT, "exam.region_m=[0.06, 0.03]", "camera.frames=4", "phantom.edge_m=0.01")
+    words = command("clean", folder, *options, settings=settings)
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     lines: list[str] = []
-    killed_at: float | None = None
-    named_after: float | None = None
+    killed_at, named_after = None, float("inf")
     for line in run.stderr:
         lines.append(line)
         if "scan" in line.split() and killed_at is None:
             time.sleep(1.0)
             service_process(run, role).kill()
             killed_at = time.monotonic()
-        if killed_at is not None and f"{role} lost at" in line and named_after is None:
-            named_after = time.monotonic() - killed_at
-    return Killed(run.wait(timeout=120), lines, float("inf") if named_after is None else named_after, folder)
+        if killed_at is not None and f"{role} lost at" in line:
+            named_after = min(named_after, time.monotonic() - killed_at)
+    return Killed(run.wait(timeout=120), lines, named_after, folder)
 
 
 def assert_held_and_no_harder(killed: Killed) -> None:

@@ -1,6 +1,5 @@
 """The wheel, installed without a checkout: without extras it is bus and contract, with [run] it examines an abdomen."""
 
-import json
 import os
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from examination import TINY, Finished, command
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -46,7 +46,7 @@ class Elsewhere:
 
 @pytest.fixture(scope="module")
 def elsewhere() -> Iterator[Elsewhere]:
-    """Return the environment of 1.5 GB is removed at the end."""
+    """Return an environment of 1.5 GB, which is removed at the end."""
     with tempfile.TemporaryDirectory(prefix="palpate-install-") as folder:
         yield Elsewhere(Path(folder))
 
@@ -60,9 +60,8 @@ def test_bare_palpate_is_bus_and_contract(elsewhere: Elsewhere) -> None:
 def test_with_run_it_examines_an_abdomen(elsewhere: Elsewhere) -> None:
     elsewhere.install("[run]")
     assert "doctor" in elsewhere.run("palpate", "--help")
-    settings = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom.edge_m=0.02", "camera.frames=2")
-    elsewhere.run("palpate", "run", "--composed", "--out", "examined", *(word for s in settings for word in ("--set", s)))
-    report = json.loads((elsewhere.folder / "examined/report.json").read_text(encoding="utf-8"))
+    elsewhere.run("palpate", *command("clean", Path("examined"), "--composed", settings=TINY)[1:])
+    report = Finished(0, "", elsewhere.folder / "examined").report
     assert report["failure"] is None
     assert report["samples"] > 5
     for name in ("report.html", "map.png", "recording_mcap/recording_mcap_0.mcap"):

@@ -18,15 +18,10 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return finished
 
 
-def replayed(reference: Finished, folder: Path, *settings: str) -> Finished:
-    settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}", *settings)
-    finished = palpate_run("clean", folder, "--composed", "--record", "none", settings=settings)
-    assert finished.status == 0, finished.output
-    return finished
-
-
 def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Finished, tmp_path: Path) -> None:
-    finished = replayed(reference, tmp_path)
+    settings = (*SHORT, "services.camera=replay", f"camera.recording={reference.folder}")
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
+    assert finished.status == 0, finished.output
     assert finished.report["run_hash"] == reference.report["run_hash"]
 
 
@@ -40,17 +35,13 @@ def test_a_stopped_assessment_is_replaced_in_a_wall_clock_run(tmp_path: Path) ->
         if second is None and "approach" in line.split():
             service_process(run, "assessment").terminate()
             time.sleep(0.5)
-            palpate = str(Path(sys.executable).with_name("palpate"))
-            second = subprocess.Popen([palpate, "takeover", "assessment", "--run", tmp_path.name])
+            second = subprocess.Popen([words[0], "takeover", "assessment", "--run", tmp_path.name])
     status = run.wait(timeout=120)
     assert second.wait(timeout=20) == 0
     text = "".join(lines)
     assert status == 0, text
-    assert "its slot is kept" in text
     assert "another process replaces assessment" in text
-    report = Finished(status, text, tmp_path).report
-    assert report["services"]["assessment"]["facts"]["samples"] >= 0
-    assert report["failure"] is None
+    assert Finished(status, text, tmp_path).report["failure"] is None
 
 
 def test_a_role_that_does_not_join_is_named_with_the_command_that_joins(tmp_path: Path) -> None:
@@ -84,10 +75,9 @@ def test_an_examination_of_the_elastic_tissue_completes_with_findings(tmp_path: 
     subprocess.run([*words, *(word for setting in ELASTIC for word in ("--set", setting))], check=True, timeout=600)
     finished = palpate_run("clean", tmp_path, "--wallclock", "--record", "none", settings=ELASTIC, timeout=300)
     assert finished.status == 0, finished.output
-    report = finished.report
-    assert report["samples"] > 50
-    assert report["findings"], finished.output
-    assert 1 < report["max_force_N"] < 20
+    assert finished.report["samples"] > 50
+    assert finished.report["findings"], finished.output
+    assert 1 < finished.report["max_force_N"] < 20
 
 
 @pytest.mark.parametrize(

@@ -2,43 +2,24 @@
 
 import pytest
 
-from palpate_bus.messages import NS
+from palpate_bus.messages import MS
+from palpate_bus.testing import HandInbox
 from research import stability
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, BusDelay, DelayedInbox, Delays, press
 from research.loop_theory import admittance_gain, linearise
 
-MS = NS // 1000
-
-
-class Bus:
-    """An inbox that brings one message a millisecond: its own time."""
-
-    def __init__(self) -> None:
-        self.t = 0
-
-    def latest(self, topic: str) -> object:
-        return self.t
-
-    def new(self, topic: str) -> list[object]:
-        return [self.t]
-
-    def stamp(self, topic: str) -> int:
-        return self.t
-
-    def lost(self, role: str) -> bool:
-        return role == "gone"
-
 
 def received(delay: BusDelay, steps: int = 60) -> list[list[object]]:
-    inbox, bus = DelayedInbox({"late": delay}), Bus()
-    out = []
+    """Return the messages of each millisecond behind a delay, of a bus that brings one a millisecond: its own time."""
+    inbox, out = DelayedInbox({"late": delay}), []
     for k in range(steps):
-        bus.t = k * MS
-        inbox.advance(bus.t, bus, {})
+        bus = HandInbox()
+        bus.stamps = bus.messages = dict.fromkeys(("late", "on time"), k * MS)
+        bus.events = {topic: [k * MS] for topic in bus.messages}
+        inbox.advance(k * MS, bus, {})
         out.append(list(inbox.new("late")))
-        assert inbox.latest("on time") == bus.t
-        assert inbox.latest("late") is None or inbox.stamp("late") == inbox.latest("late") < bus.t
-    assert inbox.lost("gone")
+        assert inbox.latest("on time") == k * MS
+        assert inbox.latest("late") is None or inbox.stamp("late") == inbox.latest("late") < k * MS
     return out
 
 
@@ -81,7 +62,4 @@ def test_an_arm_that_takes_positions_is_stable_with_any_delay(contrast: float, l
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_stability_under_delay_and_jitter() -> None:
-    missed = [
-        f"{c.name}: {c.measured}, expected {c.bound} ({c.against})" for c in stability.section().checks if c.passed is False
-    ]
-    assert not missed
+    assert not [(c.name, c.measured, c.bound) for c in stability.section().checks if c.passed is False]
