@@ -18,6 +18,8 @@ from palpate_search.posterior import POLICY, policy
 from palpate_search.service import try_policy
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
+ROLES = tuple(_ROLES)
+"""All roles but the conductor."""
 WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))
 """The roles of every examination."""
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)

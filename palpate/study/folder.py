@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from palpate.report.files import write_text
 from palpate.report.rows import Report
-from palpate.run.roles import WORKERS
+from palpate.run.roles import OBSERVERS, ROLES
 from palpate.study.cases import Case, canonical
 from palpate.study.spec import StudyError
 
@@ -33,7 +33,7 @@ ATTEMPTS: Final = 3
 NO_DIGEST: Final = "examinations in wall-clock mode depend on the machine and its load, so they have no digest"
 PACKAGES: Final = (
     "palpate.quick", "palpate.run", "palpate.truth", "palpate.report", "palpate_bus", "palpate_models", "palpate_conductor",
-    "palpate_fmu", *(f"palpate_{role}" for role in WORKERS),
+    "palpate_fmu", *(f"palpate_{role}" for role in ROLES if role not in OBSERVERS),
 )  # fmt: skip
 """Packages whose code decides results."""
 HASH: Final = "sha256"

@@ -77,11 +77,11 @@ def examine_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
             output, cause = process.stdout, f"its process ended with status {process.returncode}"
         except subprocess.TimeoutExpired as error:
             partial = error.stdout or b""
-            output = partial.decode() if isinstance(partial, bytes) else partial
+            output = partial.decode(errors="replace") if isinstance(partial, bytes) else partial
             cause = f"took longer than {limit_s:.0f} s"
         log.seek(0)
         logged = log.read().strip().splitlines()
-    attempts = [line for line in output.splitlines(keepends=True) if line.endswith("\n")]
+    *attempts, _ = output.split("\n")  # texts may have other line separators, which splitlines() would split at
     if len(attempts) < len(cases):
         attempts.append(Attempt(why=f"{cause}: {logged[-1]}" if logged else cause).model_dump_json())
     return attempts
@@ -305,10 +305,17 @@ def _attempts(future: Future[list[str]], batch: Sequence[Case]) -> list[Attempt]
         raise StudyStopped("connection to the scheduler lost")
     error = future.exception()
     if error is None:
-        return [Attempt.model_validate_json(text) for text in future.result()]
+        return [_read_attempt(text) for text in future.result()]
     if isinstance(error, KilledWorker):
         return [Attempt(why=f"its workers were lost: {error}")] * len(batch)
     raise StudyStopped(f"a worker cannot examine: {type(error).__name__}: {error}") from error
+
+
+def _read_attempt(text: str) -> Attempt:
+    try:
+        return Attempt.model_validate_json(text)
+    except ValueError:
+        return Attempt(why=f"its process wrote what is not an attempt: {text[:80]!r}")
 
 
 def _outcome(case: Case, attempt: Attempt, failures: list[str]) -> Outcome | None:
@@ -326,6 +333,6 @@ if __name__ == "__main__":
     Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
     attempts_out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries is not an attempt
-    for text in sys.stdin.read().splitlines():
+    for text in sys.stdin.read().removesuffix("\n").split("\n"):
         attempts_out.write(_examine_line(text, Path(sys.argv[1]) if len(sys.argv) > 1 else None).model_dump_json() + "\n")
         attempts_out.flush()

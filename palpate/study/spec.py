@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from palpate.run.roles import OBSERVERS, WORKERS
+from palpate.run.roles import ROLES
 from palpate.study.shift import Family
 from palpate_errors import UserError
 from palpate_inputs import parse_yaml, read_text
@@ -113,10 +113,9 @@ class Method(Section):
 
     @model_validator(mode="after")
     def _roles(self) -> Self:
-        known = (*WORKERS, *OBSERVERS)
         for field, roles in (("services", self.services), ("periods", self.periods)):
-            if wrong := [role for role in roles if role not in known]:
-                raise ValueError(f"{field}.{wrong[0]}: expected one of {', '.join(known)}")
+            if wrong := [role for role in roles if role not in ROLES]:
+                raise ValueError(f"{field}.{wrong[0]}: expected one of {', '.join(ROLES)}")
         return self
 
 
@@ -209,7 +208,11 @@ def with_methods(study: Study, only: Sequence[str] | None) -> Study:
 
 def with_services(study: Study, services: Mapping[str, str]) -> Study:
     """Return the study with a further method of these services, which has the name of the first one. Raises StudyError."""
-    name, own = Path(next(iter(services.values()))).stem.lower(), _absolute(Method(services=dict(services)), Path())
+    try:
+        own = _absolute(Method(services=dict(services)), Path())
+    except ValidationError as error:
+        raise StudyError(f"{study.name}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+    name = Path(next(iter(services.values()))).stem.lower()
     return study.model_copy(update={"methods": {**study.methods, name: own}})
 
 

@@ -9,8 +9,9 @@ import yaml
 from synthetic import TOY, study
 
 from palpate.study.cases import Case, Request, cases_of, command_of, file_hash, patient_seeds, secret_of
-from palpate.study.folder import SESSIONS, Folder, Outcome, Session, manifest_of, merge
-from palpate.study.spec import Grid, Lumps, Study, StudyError, load_study, study_names
+from palpate.study.folder import PACKAGES, SESSIONS, Folder, Outcome, Session, manifest_of, merge
+from palpate.study.runner import _read_attempt, examine_batch
+from palpate.study.spec import Grid, Lumps, Study, StudyError, load_study, study_names, with_services
 
 PLAIN = "populations: {a: {scenario: person}}\n"
 
@@ -90,6 +91,13 @@ def test_one_error_at_a_time_changes_that_error_alone() -> None:
     assert changed.model_copy(update={"force": changed.force.model_copy(update={"gain": base.force.gain})}) == base
 
 
+def test_a_method_may_have_any_service_but_the_conductor() -> None:
+    assert with_services(study(), {"search": "mine.py"}).methods["mine"].services == {"search": str(Path("mine.py").resolve())}
+    assert {"palpate_search", "palpate_planning"} <= {*PACKAGES}
+    with pytest.raises(StudyError, match=r"services\.conductor: expected one of .*search"):
+        with_services(study(), {"conductor": "mine.py"})
+
+
 def test_files_are_looked_for_beside_the_study(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("def create(scenario): ...")
     text = yaml.safe_dump({**TOY, "methods": {"mine": {"services": {"assessment": "mine.py"}}}})
@@ -142,6 +150,13 @@ def test_the_hash_of_a_python_file_includes_the_modules_of_its_folder_that_it_im
     assert found[0] != found[1] == found[2]
     (tmp_path / "package" / "inner.py").write_text("value = 2\n")
     assert file_hash.__wrapped__(str(tmp_path / "mine.py")) != found[2]
+
+
+def test_line_separators_in_texts_do_not_end_a_case_and_an_unreadable_line_is_a_failed_attempt() -> None:
+    case = cases_of(study())[0].model_copy(update={"files": {"no\u2028such\u0085file": "0"}})
+    attempts = [_read_attempt(text) for text in examine_batch([case.model_dump_json()] * 2)]
+    assert [attempt.why for attempt in attempts] == ["StudyError: no\u2028such\u0085file: No such file or directory"] * 2
+    assert _read_attempt('{"why"').why == """its process wrote what is not an attempt: '{"why"'"""
 
 
 def test_the_command_states_every_option() -> None:
