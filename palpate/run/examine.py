@@ -55,17 +55,20 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
     groups = placement((*workers(scenario), *observers), options.group or (), options.processes)
     folder = options.out or usual_folder(scenario.name)
     with results_first(), results_folder(folder, overwrite=options.overwrite):
-        if not options.silent:
-            _announce(console, scenario, options, folder)
-        with RunDisplay(console, options.silent, scenario.exam) as display, set_environment({"PALPATE_RECORD": options.record}):
-            tell = WatchedRoom(folder, display.show, say).check
-            with unless_begun(folder, lambda: display.begun), checkpoint_given(None if before is None else before.checkpoint):
+        display: RunDisplay | None = None
+        with unless_begun(folder, lambda: display is not None and display.begun):
+            if not options.silent:
+                _announce(console, scenario, options, folder)
+            record, checkpoint = {"PALPATE_RECORD": options.record}, None if before is None else before.checkpoint
+            display = RunDisplay(console, options.silent, scenario.exam)
+            with display, set_environment(record), checkpoint_given(checkpoint):
                 check_room(folder, scenario.exam, options.record)
+                tell = WatchedRoom(folder, display.show, say).check
                 result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)
                 if result.unbegun:
                     raise KeyboardInterrupt
-            if before is not None:
-                result = replace(result, run_hash=None, earlier=before.earlier)
+        if before is not None:
+            result = replace(result, run_hash=None, earlier=before.earlier)
         conclude(console, folder, scenario, result, options.silent, options.as_json)
 
 

@@ -19,10 +19,12 @@ from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
+from palpate.run import examine
 from palpate.run.conclusion import conclude
 from palpate.run import conducting
 from palpate.run.conducting import conduct_others
 from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, unless_begun
+from palpate.run.options import RunOptions
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
@@ -71,6 +73,18 @@ def test_overwriting_removes_an_earlier_run_or_restores_it_when_the_new_one_cann
         assert [path.name for path in out.iterdir()] == ["run.lock"]
     assert list(out.iterdir()) == []
     assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("where", ["_announce", "RunDisplay", "check_room"])
+def test_ctrl_c_before_the_run_restores_the_earlier_results(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    run = name_run(tmp_path)
+    monkeypatch.setattr(examine, where, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        examine.examine(load_scenario("clean"), RunOptions(out=tmp_path, overwrite=True, record="none", composed=True))
+    assert run_of(tmp_path) == run
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
