@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from itertools import chain
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -223,11 +224,16 @@ def parse_tolerance(options: list[str]) -> Tolerance:
 
 
 def as_dict(result: TopicResult) -> dict[str, Any]:
-    """Return a result for `--json`."""
+    """Return a result for `--json`, which has no infinity: null."""
     row = asdict(result)
     row["agrees"] = result.agrees
-    row["worst"] = [{**asdict(d), "ratio": d.ratio} for d in sorted(result.worst.values(), key=lambda d: -d.ratio)]
+    worst = sorted(result.worst.values(), key=lambda d: -d.ratio)
+    row["worst"] = [{**asdict(d), "deviation": _finite(d.deviation), "ratio": _finite(d.ratio)} for d in worst]
     return row
+
+
+def _finite(number: float) -> float | None:
+    return number if isfinite(number) else None
 
 
 def result_table(results: Mapping[str, TopicResult]) -> Table:

@@ -12,6 +12,7 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.messages import MS, NS, Clock, codec, time_message
 from palpate_bus.recordings import Recording, open_recording
 from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.observer import CLOCK
 from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.transport import Sender
@@ -33,7 +34,6 @@ class PlayTimes(NamedTuple):
 
 
 PLAY: Final = PlayTimes()
-CLOCK = "clock"
 
 
 class Player:

@@ -72,8 +72,6 @@ class SecureBus:
 
 
 COMPOSE = "docker-compose.yml"
-OBSERVERS = frozenset(name for name, role in contract().roles.items() if role.observer)
-"""Roles that write into the results folder."""
 BARRIER = frozenset(("robot", "control", "tissue"))
 """Roles of the 1 kHz loop. Processes with only these use the low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
@@ -242,7 +240,8 @@ class LocalProcesses:
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """Return the environment of a service beyond that of this process."""
-        files = {"scenario": self._scenario_files[process.role], "out": self._out if process.role in OBSERVERS else None}
+        out = self._out if contract().roles[process.role].observer else None  # observers write into the results folder
+        files = {"scenario": self._scenario_files[process.role], "out": out}
         settings = Settings.read({**os.environ, **process.environment}).replace(**files, **self._given)
         return {**process.environment, **FIXED, **settings.to_env(), **self.bus[process.role].to_env()}
 

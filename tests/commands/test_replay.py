@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from waiting import wait_until
 
 from palpate.commands import app_for
-from palpate.replay.compare import Tolerance, compare
+from palpate.replay.compare import FieldDifference, Tolerance, TopicResult, as_dict, compare
 from palpate.replay.golden import prepare, replay_service, rerun
 from palpate.replay.play import Player
 from palpate_bus.contract import contract
@@ -111,6 +111,13 @@ def test_a_weaker_controller_is_detected_unless_the_tolerance_allows_it(weaker: 
     assert result["worst"][0]["ratio"] > 1
     loose = palpate_replay(CONTROL, "--service", weaker, "--tolerance", "control/joint_torque:torque=2.0")
     assert loose.exit_code == 0, loose.output
+
+
+def test_a_difference_of_texts_is_null_in_json() -> None:
+    texts, finite = (FieldDifference(name, 0, "a", "b", off, 1.0) for name, off in (("text", float("inf")), ("number", 2.0)))
+    row = as_dict(TopicResult("robot/state", worst={"number": finite, "text": texts}))
+    assert [(d["name"], d["deviation"], d["ratio"]) for d in row["worst"]] == [("text", None, None), ("number", 2.0, 2.0)]
+    json.dumps(row, allow_nan=False)
 
 
 def test_a_silent_service_is_detected(tmp_path: Path) -> None:

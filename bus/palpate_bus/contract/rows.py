@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from enum import StrEnum
 from functools import cache
 from importlib import resources
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -15,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from palpate_bus.messages import MS, codec
 from palpate_bus.settings import Settings
 
+CONDUCTOR: Final = "conductor"
+"""The role that every run needs: it starts and ends the services and makes the result."""
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """PyYAML's parser in C where it was built: every process of a run reads the contract at its start."""
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -190,7 +192,7 @@ class Internal(_Row):
 
 _MAY_KNOW = {
     Visibility.SIM: {"robot", "tissue", "camera", "dashboard", "recorder"},
-    Visibility.TRUTH: {"conductor", "dashboard", "recorder"},
+    Visibility.TRUTH: {CONDUCTOR, "dashboard", "recorder"},
 }
 
 

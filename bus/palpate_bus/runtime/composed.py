@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, MutableSequence, Sequence
 from contextlib import nullcontext, suppress
 from typing import Any
 
-from palpate_bus.contract import Contract, Topic, contract as default_contract
+from palpate_bus.contract import CONDUCTOR, Contract, Topic, contract as default_contract
 from palpate_bus.messages import codec
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.group import Group
@@ -14,8 +14,6 @@ from palpate_errors import RunError
 
 Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
-CONDUCTOR = "conductor"
-"""The only observer that every run needs, since it makes the result."""
 NO_ROLE = -1
 """The number of no role, between two steps."""
 

@@ -10,7 +10,7 @@ import logging
 from time import monotonic
 from typing import Any, Final, NamedTuple
 
-from palpate_bus.contract import Contract
+from palpate_bus.contract import CONDUCTOR, Contract
 from palpate_bus.messages import NS, RunControl, ServiceReport, codec
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import is_running, pid_space
@@ -19,7 +19,6 @@ from palpate_errors import RunError
 
 log = logging.getLogger(__name__)
 
-CONDUCTOR: Final = "conductor"
 HEARTBEAT: Final = "palpate/heartbeat"
 CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
 REPORT_TYPE: Final = "palpation_msgs/msg/ServiceReport"

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate_bus.contract import Edge, Topic, Visibility
+from palpate_bus.contract import CONDUCTOR, Edge, Topic, Visibility
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import MS, CodecError, RunControl, ServiceReport
-from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
+from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Outgoing, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat

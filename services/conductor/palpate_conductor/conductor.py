@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from palpate_bus.contract import Contract, contract
+from palpate_bus.contract import CONDUCTOR, Contract, contract
 from palpate_bus.messages import MS, NS, OperatorRequest, RunControl, ServiceReport, codec, header
-from palpate_bus.runtime.conductor_link import CONDUCTOR, CONTROL_TYPE, REPORT_TYPE, TRANSPORT_LOST
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE, TRANSPORT_LOST
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.runtime.member import Member
