@@ -158,6 +158,14 @@ def test_only_what_is_complete_is_called_so(reason: Reason, count: int, phase: P
     assert ("incomplete" in exam.status.message) is ("the cause" in exam.status.message) is (count > 0)
 
 
+def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:
+    world = World(known(Robot(base_xy_m=(-0.25, 0.0)), region_m=(0.15, 0.0125), centre_m=(0.0, 0.0)))
+    world.run()
+    assert world.status.phase is Phase.DONE
+    assert 0 < world.status.targets_skipped == len(world.exam.skipped) < world.status.target_count
+    assert next(iter(world.exam.skipped.values())).reason is Reason.OUT_OF_REACH
+
+
 def test_the_arm_does_not_stretch_to_skin_deeper_than_perceived() -> None:
     world = World(known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), offset=-0.015)
     bend = []

@@ -120,6 +120,14 @@ def test_the_first_step_asks_the_arm_for_nothing() -> None:
     assert (out["exam/state"].phase, out["exam/state"].end_tick) == (Phase.HOME, -1)
 
 
+def test_the_arm_is_held_where_it_was_found() -> None:
+    inbox = HandInbox()
+    inbox.put("robot/status", status(0, HOME + 0.2, np.zeros(6)))
+    setpoint = sent(create(Scenario(robot=BASE)).step(0, inbox))["planning/setpoint"]
+    np.testing.assert_allclose(setpoint.joint_position, HOME + 0.2, atol=1e-12)
+    assert np.all(setpoint.joint_stiffness > 0)
+
+
 def idle(reason: str, mode: int = RobotStatus.MODE_IDLE) -> Any:
     return status(10 * MS, HOME, np.zeros(6), mode, reason)
 
