@@ -19,9 +19,8 @@ from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
-from palpate.run import examine
+from palpate.run import conducting, examine
 from palpate.run.conclusion import conclude
-from palpate.run import conducting
 from palpate.run.conducting import conduct_others
 from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, unless_begun
 from palpate.run.options import RunOptions
