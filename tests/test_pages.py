@@ -73,6 +73,15 @@ def test_a_wrong_command_is_refused(words: list[str]) -> None:
         parse(words)
 
 
+@pytest.mark.pages
+def test_examples_import_what_there_is() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    found = sorted({*re.findall(r"^from palpate\S* import [\w, ]+$", text, re.MULTILINE)})
+    assert "from palpate_bus.monitor.health import topic_statuses" in found
+    for line in found:
+        exec(line)
+
+
 def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings."""
     heads = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)

@@ -43,7 +43,7 @@ class Run:
     """A run in progress: the process that started it, and its bus."""
 
     name: str
-    """The scenario."""
+    """Name of the results folder."""
     endpoints: Mapping[str, str]
     """Endpoint of each role and the conductor, by role."""
     domain: int = 0

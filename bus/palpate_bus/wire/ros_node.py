@@ -62,11 +62,11 @@ class RosSubscription:
         return pairs
 
     def take(self) -> list[Any]:
-        """Return the messages of `received`."""
+        """Return the messages of `receive`."""
         return [message for _, message in self.receive()]
 
     def others(self, own: bytes) -> list[bytes]:
-        """Return the publishers' GIDs of `received`, without `own`."""
+        """Return the publishers' GIDs of `receive`, without `own`."""
         return [sender for sender, _ in self.receive() if sender != own]
 
     def newest(self) -> Any | None:
