@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 
 from palpate.check.perform import LiveRig, start_implementation
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites import SUITES, check
+from palpate.check.suites import SUITES, check, robot
 from palpate.check.suites.tissue import STILL
+from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.implementations import create, kind
-from palpate_bus.messages import MS, NS, Point, Pose, SupervisorState, Vector3, duration_message
+from palpate_bus.messages import MS, NS, Point, Pose, SupervisorState, Vector3, codec, duration_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import load_scenario
@@ -123,6 +125,35 @@ def test_a_robot_is_not_moved_without_consent() -> None:
     assert any("--motion" in result.got for result in report.results)
     q = np.array([logged.message.position for logged in rig.log["joint_states"]])
     assert np.ptp(q, axis=0).max() < 1e-3
+
+
+class RefusingRig(ServiceRig):
+    """A rig whose ports refuse messages that break the contract, as on a live bus."""
+
+    live = True
+
+    def __init__(self, service: Service, settings: RigSettings) -> None:
+        super().__init__(service, settings)
+        self.torques: list[float] = []
+        """Largest torque of each command [N m]."""
+
+    def send(self, topic: str, message: Any) -> None:
+        row, buffer = self.contract.topics[topic], self._stepper.buffers[topic]
+        if topic == robot.COMMAND and len(message.torque):
+            self.torques.append(float(np.max(message.torque)))
+        with suppress(RefusedMessage):
+            buffer.check(buffer.decode(codec.encode(message, row.type)), self.t)
+            super().send(topic, message)
+
+
+def test_a_live_robot_is_commanded_little_beyond_its_limit_and_may_refuse_it() -> None:
+    rig = RefusingRig(made("robot"), RigSettings(SCENARIO, slack_ms=20))
+    rig.run(0.1, robot.quiet(rig))
+    robot._invalid(rig)
+    assert len(rig.report.results) == 2
+    assert rig.report.failed == []
+    (beyond,) = (torque for torque in rig.torques if torque > 10)
+    assert 1.0 < beyond / robot._arm(rig).torque_nm[0] < 1.05
 
 
 TIMELY = ("rate", "stamps", "within", "sequence")

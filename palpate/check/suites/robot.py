@@ -1,5 +1,6 @@
 """Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
+from itertools import chain, repeat
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ class RobotTouches(NamedTuple):
     """Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
     push_rad: float = 0.01
     """Position step [rad] for an arm that takes positions."""
+    beyond: float = 1.02
+    """Torque beyond its limit for a live arm, over the limit: a driver that does not check it applies it."""
+    jump_rad: float = 0.1
+    """Jump of a position for a live arm: more than the fastest joint travels within a few ms."""
     moved_rad: float = 2e-4
     drift_rad: float = 0.05
     press_n: float = 10.0
@@ -199,24 +204,37 @@ def _expiry(rig: Rig) -> None:
     _expect_mode(rig, "the hold is latched: new commands do not end it", RobotStatus.MODE_SAFE_HOLD)
 
 
-def _provoke(rig: Rig, what: str, push: Any, cause: int) -> None:
+def _once(rig: Rig, push: Any) -> Feed:
+    """Return the inputs with one command `push`, followed by commands to stay."""
+    still = commanding(rig, _still(rig))
+    sources = chain([commanding(rig, push)[COMMAND]], repeat(still[COMMAND]))
+
+    def command(t: int) -> Any:
+        return next(sources)(t)
+
+    return {**still, COMMAND: command}
+
+
+def _provoke(rig: Rig, what: str, push: Any, *causes: int) -> None:
+    """Expect a hold for a command; a live arm is sent it once."""
     _activate(rig)
-    received = rig.run(0.1, commanding(rig, push))["robot/status"]
-    received += rig.run(0.05 + rig.slack_s, quiet(rig))["robot/status"]
-    _expect_hold(rig, f"{what} makes it hold", received, cause)
+    received = rig.run(0.1, (_once if rig.live else commanding)(rig, push))["robot/status"]
+    received += rig.run(0.1 + rig.slack_s, quiet(rig))["robot/status"]
+    _expect_hold(rig, f"{what} makes it hold", received, *causes)
 
 
 def _invalid(rig: Rig) -> None:
+    refused = CEASED if rig.live else ()  # the port of a live service refuses these, so that the driver does not see them
     bad = _still(rig)
     bad[3] = np.nan
-    _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
+    _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND, *refused)
     huge = _still(rig)
     if _positions(rig):
-        huge[0] = 1.0
+        huge[0] = TOUCH.jump_rad if rig.live else 1.0
         _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND)
         return
-    huge[0] = 10 * _arm(rig).torque_nm[0]
-    _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
+    huge[0] = (TOUCH.beyond if rig.live else 10) * _arm(rig).torque_nm[0]
+    _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT, *refused)
 
 
 def _stop(rig: Rig) -> None:
