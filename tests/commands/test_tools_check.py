@@ -16,7 +16,7 @@ from palpate.check.suites import SUITES, check, robot
 from palpate.check.suites.tissue import STILL
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.implementations import create, kind
-from palpate_bus.messages import MS, NS, Point, Pose, SupervisorState, Vector3, codec, duration_message
+from palpate_bus.messages import MS, NS, Point, Pose, RobotStatus, SupervisorState, Vector3, codec, duration_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import load_scenario
@@ -149,8 +149,10 @@ class RefusingRig(ServiceRig):
 def test_a_live_robot_is_commanded_little_beyond_its_limit_and_may_refuse_it() -> None:
     rig = RefusingRig(made("robot"), RigSettings(SCENARIO, slack_ms=20))
     rig.run(0.1, robot.quiet(rig))
+    rig.run(0.7, robot.commanding(rig, np.zeros(robot._arm(rig).joints)))  # longer than the port takes equal commands
+    robot._expect_mode(rig, "is active", RobotStatus.MODE_ACTIVE)
     robot._invalid(rig)
-    assert len(rig.report.results) == 2
+    assert len(rig.report.results) == 3
     assert rig.report.failed == []
     (beyond,) = (torque for torque in rig.torques if torque > 10)
     assert 1.0 < beyond / robot._arm(rig).torque_nm[0] < 1.05

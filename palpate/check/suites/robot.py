@@ -25,6 +25,8 @@ class RobotTouches(NamedTuple):
     """Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
     push_rad: float = 0.01
     """Position step [rad] for an arm that takes positions."""
+    ripple_nm: float = 1e-3
+    """Alternating part of a torque for a live arm: its port refuses a command that repeats for half a second."""
     beyond: float = 1.02
     """Torque beyond its limit for a live arm, over the limit: a driver that does not check it applies it."""
     jump_rad: float = 0.1
@@ -70,7 +72,12 @@ def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK) -> Fe
         values = values + rig.last("joint_states").position
     torque, position = (none, values) if _positions(rig) else (values, none)
     valid = duration_message(rig.contract.topics[COMMAND].expiry)
-    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), torque, position, valid, "", "")}
+    ripple_nm = TOUCH.ripple_nm if rig.live else 0.0
+
+    def command(t: int) -> Any:
+        return JointTorqueCommand(header(t), torque + ripple_nm * (t // MS % 2), position, valid, "", "")
+
+    return {**quiet(rig, level), COMMAND: command}
 
 
 def suite(rig: Rig) -> None:
