@@ -57,7 +57,7 @@ def place(
     arm: Name,
     scenario: Annotated[str, typer.Argument(help="Scenario whose region is to be reached, by name or file.")] = DEFAULT_SCENARIO,
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("place.png"),
-    height: Annotated[float | None, typer.Option("--height", help="Keep this height of the base, in metres.", min=0.3, max=1.4)] = None,
+    height: Annotated[float | None, typer.Option("--height", help="Height of the base to keep, in m.", min=0.3, max=1.4)] = None,
     settings: Settings = None,
 ) -> None:
     """Find where the base should stand to reach a scenario's region, and draw which targets it reaches."""
