@@ -6,7 +6,7 @@
     ((100,), True)
 
 Positions are in the true abdomen frame A: x to the patient's left, y to the head, z outward, from the umbilicus. The patient
-breathes, guards and moves as in the scenario; earlier presses have lasting effects. The indenter follows the breath as
+breathes and guards as in the scenario, and lies still; earlier presses have lasting effects. The indenter follows the breath as
 `exam.breathing` says.
 """
 
@@ -22,9 +22,8 @@ from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array, Mask, inverse, matrix
-from palpate_models.patient.motion import BodyMotion
-from palpate_models.scenario.load import restrict_to_view, true_pose, whole_scenario
+from palpate_models.numerics.frames import Array, Mask, matrix
+from palpate_models.scenario.load import ScenarioError, restrict_to_view, true_pose, whole_scenario
 from palpate_models.scenario.patterns import stations
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_perception.pipeline import PIPELINE
@@ -78,15 +77,20 @@ class Touch(NamedTuple):
 
 
 class Patient:
-    """A patient and an indenter. Equal scenarios and motions give equal forces."""
+    """A patient who lies still, and an indenter. Equal scenarios and presses give equal forces."""
 
     def __init__(self, scenario: str | Path | Scenario, seed: int | None = None, *, time: float = 0.0) -> None:
         """Build the patient of a scenario (name, YAML file or object), untouched, at `time` [s].
 
-        `seed` replaces that of a scenario given by name or file. Raises ScenarioError for an invalid scenario, MeshError for a
-        body that cannot be built, NoTissueError for a tissue without a copy.
+        `seed` replaces that of a scenario given by name or file. Raises ScenarioError for an invalid scenario and for a patient
+        who moves, MeshError for a body that cannot be built, NoTissueError for a tissue without a copy.
         """
         scenario = whole_scenario(scenario, seed)
+        if (moves := scenario.phantom.motion.kind) != "none":
+            raise ScenarioError(
+                f"{scenario.name}: phantom.motion.kind = {moves!r}: expected none, for palpate.Patient and tier: quick press a "
+                "patient who lies still; palpate run and tier: whole examine one who moves"
+            )
         choice = scenario.services.tissue
         if kind("tissue").foreign(choice):
             part = f"services.tissue = {choice!r}"
@@ -95,7 +99,7 @@ class Patient:
         if tissue is None:
             raise NoTissueError(
                 f"{scenario.name}: services.tissue = {scenario.services.tissue!r} cannot be pressed without a run; "
-                "expected one of winkler, elastic, fmu, or a file whose service is a TissueService"
+                "expected winkler, elastic, fmu without tissue.fmu and tissue.fmu_map, or a file whose service is a TissueService"
             )
         self.scenario = scenario
         self.tissue = tissue.in_steps_of(PERIOD_S)
@@ -106,7 +110,6 @@ class Patient:
         """Radius of the indenter [m]."""
         self.X_WA: Array = matrix(true_pose(scenario))
         """True pose, shape (4, 4)."""
-        self._motion = BodyMotion(scenario.phantom.motion, scenario.seed)
         self._steps = max(1, round(PERIOD_S / self.tissue.dt))
         self._ticks = round(time / PERIOD_S)
         self._p: Array | None = None
@@ -172,9 +175,9 @@ class Patient:
                 self.tissue.idle(self.time - PERIOD_S * (1 - k / self._steps))
 
     def move(self, p: Array) -> Array:
-        """Move the sphere's centre straight to `p` [m], shape (3,), in the initial frame A, within PERIOD_S.
+        """Move the sphere's centre straight to `p` [m], shape (3,), within PERIOD_S.
 
-        Returns the mean force on the sphere during this time [N], shape (3,). After a rest the motion begins at `p`. Raises
+        Returns the mean force on the sphere during this time [N], shape (3,). After a rest the sphere begins at `p`. Raises
         PluginError if a tissue of a user's file wants to end the program.
         """
         try:
@@ -184,29 +187,20 @@ class Patient:
 
     def _pressed_force(self, p: Array) -> Array:
         self._tick()
-        if self._motion.moves and self.time > self._motion.at_s:
-            X = inverse(self._motion.pose(self.time))
-            p = X[:3, :3] @ p + X[:3, 3]
         before = p if self._p is None else self._p
         way = p - before
         velocity, self._p = way / PERIOD_S, p
         if self._steps == 1:
-            force, _ = self.tissue.step(self.time, p, velocity, self.radius)
-            return self._to_A(force)
+            return self.tissue.step(self.time, p, velocity, self.radius)[0]
         total = np.zeros(3)
         for k in range(1, self._steps + 1):
             share = k / self._steps
             total += self.tissue.step(self.time - PERIOD_S * (1 - share), before + share * way, velocity, self.radius)[0]
-        return self._to_A(total / self._steps)
+        return np.asarray(total / self._steps)
 
     def _tick(self) -> None:
         self._ticks += 1
         self.time = self._ticks * PERIOD_S
-
-    def _to_A(self, force: Array) -> Array:
-        """Return a force in the body's axes in those of A."""
-        moved = self._motion.moves and self.time > self._motion.at_s
-        return np.asarray(self._motion.pose(self.time)[:3, :3] @ force) if moved else force
 
     def _within_limits(self, depth: float, speed: float) -> None:
         limits = self.scenario.limits

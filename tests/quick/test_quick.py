@@ -11,7 +11,7 @@ from palpate.quick.case import QuickCase, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import QuickExamination
 from palpate.quick.patient import NoTissueError, Patient, Touch
-from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
 from research.loop_errors import renewed
@@ -20,7 +20,7 @@ SMALL = ("exam.region_m=[0.06, 0.05]", "exam.centre_m=[-0.05, -0.05]")
 ALONE = """
 import sys
 from palpate.quick.case import run_quick
-from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.load import ScenarioError, load_scenario
 print(run_quick(load_scenario("lump", sys.argv[1:], 3)).report.run_hash)
 """
 CLEAN = (*SMALL, "errors=none", "phantom.breathing.kind=none")
@@ -138,6 +138,11 @@ def test_a_tissue_without_a_copy_is_refused() -> None:
     real = scenario(1).model_copy(update={"services": scenario(1).services.model_copy(update={"tissue": "none"})})
     with pytest.raises(NoTissueError, match=r"services\.tissue"):
         Patient(real)
+
+
+def test_a_patient_who_moves_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"phantom\.motion\.kind = 'shift': expected none"):
+        run_quick(scenario(1, settings=(*SMALL, "phantom.motion.kind=shift")))
 
 
 @pytest.mark.parametrize("leave", ["raise SystemExit(0)", "__import__('os')._exit(0)"])
