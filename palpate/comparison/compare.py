@@ -29,6 +29,10 @@ class CompareTuning(NamedTuple):
     surface_m: float = 0.001
     """Distance of surfaces that counts as much as `log_force`."""
     log_force: float = 0.1
+    saturation: float = 3.0
+    """A disagreement, in those units, from which more counts little."""
+    overlap: float = 0.5
+    """Minimum share of B's map on that of A: of a smaller one, what lacks counts as a complete disagreement."""
     near_m: float = 0.005
     """Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
     min_places: int = 10
@@ -185,17 +189,20 @@ def _registration(a: ComparedPalpation, b: ComparedPalpation) -> Array:
     force = _on(a, np.log(a.map.apparent))
     scanned = b.map.scanned
     points, felt = b.map.vertices[scanned], np.log(b.map.apparent[scanned])
-    felt = felt - np.median(felt) + np.median(np.log(a.map.apparent[a.map.scanned]))
     middle = points.mean(axis=0)
     start = np.concatenate((a.map.vertices[a.map.scanned].mean(axis=0) - middle, np.zeros(3)))
 
-    def placed(motion: Array) -> Array:
-        return np.asarray(Rotation.from_rotvec(motion[3:]).apply(points - middle) + middle + motion[:3])
-
     def misfit(motion: Array) -> Array:
-        p = placed(motion)
-        rows = (height(p[:, :2]) - p[:, 2]) / TUNING.surface_m, (force(p[:, :2]) - felt) / TUNING.log_force
-        return np.asarray(np.nan_to_num(np.clip(np.concatenate(rows), -3, 3), nan=1.0))  # a place off the map costs one SD
+        """Return values whose sum of squares is the mean over the overlap, where B is brought to the level of A."""
+        p = Rotation.from_rotvec(motion[3:]).apply(points - middle) + middle + motion[:3]
+        ratio = force(p[:, :2]) - felt
+        both = np.isfinite(ratio)
+        level = np.median(ratio[both]) if both.any() else 0.0
+        rows = np.concatenate(((height(p[:, :2]) - p[:, 2]) / TUNING.surface_m, (ratio - level) / TUNING.log_force))
+        there = np.isfinite(rows)
+        lacking = max(TUNING.overlap * len(rows) - there.sum(), 0.0)
+        costs = np.arctan(np.nan_to_num(rows, nan=0.0) / TUNING.saturation)  # has a slope beyond it, where a clip has none
+        return np.asarray(np.append(costs, np.pi / 2 * np.sqrt(lacking)) / np.sqrt(there.sum() + lacking))
 
     motion = least_squares(misfit, start, x_scale=[0.002] * 3 + [0.05] * 3).x
     R = Rotation.from_rotvec(motion[3:]).as_matrix()

@@ -19,9 +19,9 @@ def _body(xy: Array) -> tuple[Array, Array]:
     return -4.0 * (x**2 + 2 * y**2), 2.0 + 2.0 * np.exp(-((y - 0.004) ** 2 + (0.3 * x) ** 2) / 5e-5) + 10 * x
 
 
-def _palpated(name: str, scale: float, sd: float, seed: int) -> ComparedPalpation:
+def _palpated(name: str, scale: float, sd: float, seed: int, centre: tuple[float, float] = (0.0, 0.0)) -> ComparedPalpation:
     axis = np.arange(-0.03, 0.0301, 0.002)
-    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + centre
     height, force = _body(xy)
     rng = np.random.default_rng(seed)
     apparent = scale * force * np.exp(sd * rng.standard_normal(len(xy)))
@@ -58,6 +58,13 @@ def test_moved_body_is_registered() -> None:
     assert found.dice is not None
     assert found.dice > 0.8
     assert found.rank_correlation > 0.9
+
+
+@pytest.mark.parametrize("centre", [(0.01, 0.0), (0.007, -0.007)])
+def test_a_stiffer_map_of_a_region_10_mm_aside_is_registered_where_they_overlap(centre: tuple[float, float]) -> None:
+    found = compare(_palpated("a", 1.0, 0.02, 0), _palpated("b", 1.2, 0.0, 1, centre), register=True).figures
+    assert np.linalg.norm((np.array(found.X_AB) @ (*centre, 0.0, 1.0))[:3] - (*centre, 0.0)) < 2e-3
+    assert found.level == pytest.approx(1.2, rel=0.02)
 
 
 def test_bodies_without_common_places_are_refused() -> None:
