@@ -136,13 +136,13 @@ class Pressed(NamedTuple):
 def true_tissue(scenario: Scenario) -> TissueBackend | None:
     """Return the tissue of a scenario, of any implementation, at rest, on a body that does not move.
 
-    None if it cannot be copied: a foreign FMU, a custom service, real tissue.
+    None if it cannot be copied: an FMU with a file or a map of the user's, a custom service, real tissue.
     """
     from palpate_bus.implementations import create  # noqa: PLC0415 - imports a service, which reading results does not need
     from palpate_tissue.service import TissueService  # noqa: PLC0415
 
     chosen = scenario.services.tissue
-    if chosen == "none" or (chosen == "fmu" and scenario.tissue.fmu is not None):
+    if chosen == "none" or (scenario.tissue.fmu or scenario.tissue.fmu_map) is not None:
         return None
     still = scenario.phantom.model_copy(update={"motion": Motion()})
     tier = "winkler" if chosen == "fmu" else chosen  # the tier with the equations of our own FMU
@@ -169,9 +169,8 @@ def press_patient(scenario: Scenario) -> Pressed | None:
     model = body.model
     skin = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
     places, normals = _places(skin, scenario.exam, (*lesions, *structures))
-    arrays = (model.vertices, model.areas, model.stiffness, model.background, model.stiffening, model.tension)
     words = (phantom.model_copy(update={"breathing": Breathing(kind="none")}), scenario.services.tissue, radius)
-    key = content_key("pressed", _code(scenario), *arrays, places, *words)
+    key = content_key("pressed", _code(scenario), *vars(model).values(), places, *words)
 
     def press(tissue: TissueBackend, where: Mask, otherwise: Array) -> Array:
         felt = otherwise.copy()

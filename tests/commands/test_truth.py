@@ -1,11 +1,13 @@
 """The truth by pressing: a copy of the patient, felt with its lumps and without."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from palpate.truth import pressed
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface, press_patient, resting_tissue
 from palpate_models.patient.phantom import flat_phantom
@@ -150,9 +152,27 @@ def test_a_patient_is_pressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         press_patient(flat(tmp_path, LESION.model_copy(update={"contrast": 3.0})))
 
 
-def test_no_copy_is_made_of_a_foreign_or_a_real_tissue(tmp_path: Path) -> None:
-    assert press_patient(load_scenario("healthy", ["services.tissue=none"])) is None
-    assert press_patient(load_scenario("healthy", ["services.tissue=fmu", "tissue.fmu=theirs.fmu"])) is None
+def test_bodies_that_differ_in_youngs_modulus_alone_do_not_share_a_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, keys = flat_phantom(0.12, 0.006), set()
+
+    def remember(key: str, _: object) -> np.ndarray:
+        keys.add(key)
+        return np.zeros((5, 1))
+
+    monkeypatch.setattr(pressed, "remember", remember)
+    for young in (1e4, 2e4):
+        wall = WinklerTissue(replace(model, young=np.full(len(model.vertices), young)))
+        monkeypatch.setattr(pressed, "resting_tissue", lambda _, wall=wall: wall)
+        press_patient(load_scenario("healthy", [REGION]))
+    assert len(keys) == 2
+
+
+@pytest.mark.parametrize("settings", [("none",), ("fmu", "tissue.fmu=theirs.fmu"), ("fmu", "tissue.fmu_map=theirs.yaml")])
+def test_no_copy_is_made_of_a_foreign_or_a_real_tissue(settings: tuple[str, ...]) -> None:
+    assert press_patient(load_scenario("healthy", [f"services.tissue={settings[0]}", *settings[1:]])) is None
+
+
+def test_no_copy_is_made_of_a_service_without_a_backend(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(
         "from palpate_bus.service import Service\nclass Own(Service):\n    role = 'tissue'\n"

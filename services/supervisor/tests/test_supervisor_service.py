@@ -1,6 +1,7 @@
 """Limits that the supervisor watches, its latch, and the service."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -314,6 +315,18 @@ def test_what_was_measured_stands_until_it_is_measured_again() -> None:
         after(service, n * 10 * MS, {"robot/status": status(n * 10 * MS, 0.0 if n < 2 else 45.0)})
     state = after(service, 30 * MS, request(OperatorRequest.RELEASE))
     assert (state.level, state.releases) == (SupervisorState.LEVEL_EMERGENCY, 0)
+
+
+def test_every_status_counts_after_a_late_step() -> None:
+    """The force by the joints is an integral over all measurements."""
+    pushed = HOLDING + 8.0 * (np.arange(7) == 1)
+    statuses = [replace(status(n * 10 * MS, 5.0), measured_torque=pushed if n > 3 else HOLDING) for n in range(8)]
+    service, late, inbox = create(load_scenario("healthy")), create(load_scenario("healthy")), HandInbox()
+    for n, each in enumerate(statuses):
+        state = after(service, n * 10 * MS, {"robot/status": each})
+        inbox.put("robot/status", each)
+    assert state.joint_force > 1.0
+    assert late.step(70 * MS, inbox)["supervisor/state"].joint_force == state.joint_force
 
 
 def test_a_measurement_that_is_only_repeated_is_silence() -> None:
