@@ -45,7 +45,7 @@ def bench(
     finally:  # an error or Ctrl-C keeps what was measured
         for table in tables(figures):
             console.print(table)
-        if out.is_file():
+        if figures["runs"]:
             console.print(f"{platform.platform()}, written to {out}")
 
 

@@ -2,7 +2,7 @@
 
 A case hits one service or its messages, or the whole run: the conductor, the recorder, several roles, the network, the machine.
 There is a list of cases, and random ones: a seed determines roles, kind and time in contact. Faults in messages that are sent
-only before contact are injected during the camera burst. The result has the first sign of the fault and its delay, the peak true
+only before contact are injected before the camera burst. The result has the first sign of the fault and its delay, the peak true
 force, and the outcome of the run. Delays are wall times with a resolution of 20 ms.
 """
 
@@ -27,21 +27,22 @@ from palpate.run.group import one_per_process
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.fault_cases import MESSAGE_KINDS, PROCESS_KINDS, SCARCE_KINDS, CaseOutcome, CaseResult, FaultCase
 from palpate_benchmarks.faulty import InjectedFault, command
-from palpate_benchmarks.injection import CONDUCTOR, ROLES, FaultLog, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
-from palpate_bus.contract import contract
+from palpate_benchmarks.injection import ROLES, FaultLog, FaultResult, FaultRun, Injector, inject_fault, logged, sustained_rate
+from palpate_benchmarks.liar import INJECTED
+from palpate_bus.contract import CONDUCTOR, Topic, contract
 from palpate_bus.messages import NS, ExamState, RobotStatus, SupervisorState, nanoseconds
+from palpate_bus.messages.fields import leaves
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
+from palpate_errors import RunError
 
 LASTING: Final = frozenset({"nan", "stamp"})
 """Kinds that affect every message from the fault on; the others affect one."""
-BEFORE_CONTACT: Final = frozenset({"camera", "perception"})
-"""Producers whose messages are sent before contact."""
-UNSENT: Final = "assessment/findings"
-"""Topic that an undisturbed examination does not send while a fault can be injected."""
+BEFORE_CONTACT: Final = frozenset({"camera", "perception", "planning/camera_trigger", "planning/path"})
+"""Topics whose messages are sent before contact, and producers of such topics."""
 AFTER_SCAN: Final = "assessment"
 """Role whose faults may have their first effect after the scan."""
 DASHBOARD: Final = "dashboard"
@@ -100,8 +101,15 @@ def _list_faults() -> Iterator[tuple[str, str]]:
     yield from (("starve", f"{MACHINE}, {seconds} s") for seconds in CASES.starved_s)
     yield from ((PARTITION, f"network, {seconds} s") for seconds in CASES.partitions_s)
     yield from ((kind, role) for kind in PROCESS_KINDS for role in WORKERS)
-    topics = [t.name for t in contract().topics.values() if t.producer in WORKERS and not t.latched and t.name != UNSENT]
-    yield from ((kind, topic) for kind in MESSAGE_KINDS for topic in topics)
+    topics = [topic for topic in contract().topics.values() if topic.producer in WORKERS and not topic.latched]
+    yield from ((kind, topic.name) for kind in MESSAGE_KINDS for topic in topics if _changes(kind, topic))
+
+
+def _changes(kind: str, topic: Topic) -> bool:
+    """Return False for a fault in fields that the topic does not have."""
+    if kind == "nan":
+        return any(leaf.base.startswith("float") for leaf in leaves(topic.type))
+    return kind != "stamp" or any(leaf.path.startswith("header.") for leaf in leaves(topic.type))
 
 
 def draw_cases(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
@@ -115,17 +123,21 @@ def draw_cases(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCas
 
 def run_case(case: FaultCase, folder: Path, settings: tuple[str, ...] = ()) -> CaseResult:
     """Run one case; its logs stay in a subfolder of `folder`."""
-    result = CaseResult(case.kind, case.target, case.mode, at_s=case.at_s)
+    result = case.result()
     begin = monotonic()
     run, inject = prepare(case, (folder / case.name).resolve(), sustained_rate() if case.wallclock else 1.0)
     run = run._replace(settings=settings)
-    with _network(case) as name:
-        ended = inject_fault(run, inject, name)
-        if ended is None and case.wallclock:
-            ended = inject_fault(run._replace(rate=sustained_rate(reserve=True)), inject, name)
+    ended, reason = None, "the run ended before it was due"
+    try:
+        with _network(case) as name:
+            ended = inject_fault(run, inject, name)
+            if ended is None and case.wallclock:
+                ended = inject_fault(run._replace(rate=sustained_rate(reserve=True)), inject, name)
+    except RunError as error:  # one case must not end the campaign
+        result.hung, reason = True, str(error)
     result.wall_s = round(monotonic() - begin, 1)
     if ended is None:
-        result.ended = "the fault was not injected: the indenter did not reach the depth"
+        result.ended = f"the fault was not injected: {reason}"
     else:
         judge(result, ended, _culprits(case))
     return result
@@ -149,7 +161,7 @@ def _of_one_service(case: FaultCase, folder: Path, rate: float) -> tuple[FaultRu
     elif case.kind in MESSAGE_KINDS:
         lasting = case.kind in LASTING or (case.wallclock and case.kind == "drop")
         faulty = (role, *command(role, InjectedFault(case.target, case.kind, count=0 if lasting else 1)))
-        if role in BEFORE_CONTACT:
+        if BEFORE_CONTACT & {role, case.target}:
             phase = ExamState.PHASE_LOOK
         if not case.wallclock:  # in lockstep messages do not depend on the placement of the other services
             groups = (role,), tuple(other for other in WORKERS if other != role)
@@ -254,8 +266,10 @@ def judge(result: CaseResult, ended: FaultResult, culprits: Sequence[str]) -> No
     result.ended = "complete" if run.failure is None else run.failure.text
     enter(result, log, culprits, ended.injected_s * NS)
     if CONDUCTOR in culprits:
-        result.sign = _conductor_lost(ended.folder)
+        result.sign = logged(ended.folder, CONDUCTOR_LOST_LOG)
         result.named = result.named or bool(result.sign)
+    if result.kind in MESSAGE_KINDS and not logged(ended.folder, INJECTED):
+        result.injected_s, result.ended = None, f"the fault was not injected: no message was changed; {result.ended}"
     remove_leftovers()
     result.left_behind = str(ended.sockets) if ended.sockets.exists() else ""
 
@@ -268,16 +282,6 @@ def _recover(result: CaseResult, folder: Path) -> RunResult:
         run = RunResult("", Collected(), failure=Failure(FailureCode.UNFINISHED, str(error)))
     result.kept = bool(run.collected.exam_states)
     return run
-
-
-def _conductor_lost(folder: Path) -> str:
-    """Return the log message of a service that lost the conductor."""
-    code = CONDUCTOR_LOST_LOG.partition(" ")[0]
-    for path in sorted((folder / "logs").glob("*.log")):
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if code in line:
-                return f"{path.stem}: conductor lost: {line.partition(code)[2].strip()}"
-    return ""
 
 
 def enter(result: CaseResult, log: FaultLog, culprits: Iterable[str], at: float) -> None:

@@ -10,9 +10,8 @@ from typing import Final, NamedTuple
 from pydantic import TypeAdapter
 
 PROCESS_KINDS: Final = ("kill", "freeze", "jump")
-CHANGE_KINDS: Final = ("corrupt", "truncate", "nan", "stamp")
-"""Kinds that change a message; see `palpate_benchmarks.faulty`."""
-MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGE_KINDS)
+MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", "corrupt", "truncate", "nan", "stamp")
+"""Faults in messages; see `palpate_benchmarks.faulty`."""
 SCARCE_KINDS: Final = ("memory", "disk", "starve")
 """Shortages: of memory for a service, of disk space for the recorder, of processor time for all."""
 WHOLE_RUN_KINDS: Final = (*SCARCE_KINDS, "partition")
@@ -66,6 +65,7 @@ class LieVerdict(StrEnum):
     NAMED = "named by a service"
     HARMLESS = "no harm"
     UNDETECTABLE = "not detectable"
+    NOT_SENT = "not sent"
     BAD = "bad"
 
 
@@ -79,10 +79,9 @@ class FaultCase(NamedTuple):
     at_s: float = LIMITS.at_depth_s
     """Simulated time at depth before the fault."""
 
-    @property
-    def identity(self) -> tuple[str, str, str, float]:
-        """Kind, target, mode and time, as in its result."""
-        return self.kind, self.target, self.mode, self.at_s
+    def result(self) -> "CaseResult":
+        """Return the result of the case before it is run."""
+        return CaseResult(self.kind, self.target, self.mode, at_s=self.at_s)
 
     @property
     def mode(self) -> str:
@@ -106,7 +105,7 @@ class CaseResult:
     injected_s: float | None = None
     """Simulated time of the fault; None if it was not injected."""
     detected_ms: float | None = None
-    """Wall time from the fault to its first sign."""
+    """Time from the fault to its first sign: wall time, or simulated time for a lie."""
     sign: str = ""
     """Text of the first sign."""
     reaction: str = ""
@@ -164,7 +163,7 @@ class CaseResult:
     def lie_verdict(self) -> LieVerdict:
         """Verdict on a lie."""
         if not self.passed:
-            return LieVerdict.BAD
+            return LieVerdict.NOT_SENT if self.injected_s is None else LieVerdict.BAD
         if self.outcome.unharmed:
             return LieVerdict.HARMLESS
         if self.undetectable:

@@ -57,6 +57,7 @@ def faults(  # noqa: PLR0913 - the options of a command
         todo += [*lies.cases(modes, only or ()), *lies.draw_lies(random, seed, modes)]
     else:
         todo += draw_cases(random, seed, modes)
+    todo = list(dict.fromkeys(todo))
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
     changed = tuple(settings or ())
@@ -64,13 +65,14 @@ def faults(  # noqa: PLR0913 - the options of a command
     code = sha256("\n".join((code_digest(), *changed)).encode()).hexdigest()[:8]
     done = {result.identity: result.code for result in found}
     if not again:
-        todo = [case for case in todo if done.get(case.identity) != code]
-    todo = sorted(todo, key=lambda case: case.identity in done)[:limit]
+        todo = [case for case in todo if done.get(case.result().identity) != code]
+    todo = sorted(todo, key=lambda case: case.result().identity in done)[:limit]
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
         results = (run_case(case, Path(folder), changed) for case in todo if case.kind != LIE)
-        lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder), changed) if LIE in kinds else ()
-        for number, result in enumerate(chain(results, lying), 1):
+        lying = [case for case in todo if case.kind == LIE]
+        lied = lies.run_lies(lying, Path(folder), changed) if lying else ()
+        for number, result in enumerate(chain(results, lied), 1):
             result.code = code
             found = [f for f in found if f.identity != result.identity] + [result]
             write_text(out, csv_text(found))

@@ -17,6 +17,7 @@ messages, 0 for all. `palpate faults` starts its processes in this way.
 | `jump` | the wall clock of this process is an hour ahead; the topic is `clock` |
 """
 
+import logging
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -26,7 +27,7 @@ from time import sleep
 import numpy as np
 import zenoh
 
-from palpate_benchmarks.liar import fill, shift_stamp
+from palpate_benchmarks.liar import INJECTED, fill, shift_stamp
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import NS, codec
 from palpate_bus.messages.fields import leaves, numbers
@@ -82,6 +83,7 @@ class FaultySender:
     def __init__(self, sender: Sender, topic: Topic, fault: InjectedFault, triggered: Callable[[], bool]) -> None:
         self._sender, self._topic, self._fault, self._triggered = sender, topic, fault, triggered
         self._left = fault.count
+        self._injected = False
 
     def put(self, payload: bytes, sequence: int) -> None:
         """Send a message, with the fault if it is due."""
@@ -92,15 +94,17 @@ class FaultySender:
             return
         self._left -= 1
         kind = self._fault.kind
+        sent = CHANGES[kind](payload, self._topic) if kind in CHANGES else payload
+        if not self._injected and (kind not in CHANGES or sent != payload):
+            self._injected = True
+            logging.getLogger(__name__).warning(INJECTED, f"{kind} {self._topic.name}")
         if kind == "drop":
             return
         if kind == "delay":
             sleep(0.5)
-        if kind in CHANGES:
-            payload = CHANGES[kind](payload, self._topic)
-        self._sender.put(payload, sequence)
+        self._sender.put(sent, sequence)
         if kind == "duplicate":
-            self._sender.put(payload, sequence)
+            self._sender.put(sent, sequence)
 
     def hello(self) -> None:
         """Send the empty message that tests the edge; the fault does not affect it."""

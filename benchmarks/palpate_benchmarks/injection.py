@@ -27,13 +27,16 @@ from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, TEST, measure
 from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
+from palpate_bus.contract import CONDUCTOR
 from palpate_bus.messages import NS, ExamState, RobotStatus, SupervisorState
+from palpate_bus.messages.codes import Phase
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import Collected
 from palpate_conductor.conductor import conduct
 from palpate_conductor.grants import GRANTS
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Timing
+from palpate_errors import RunError
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 
@@ -47,9 +50,7 @@ SETTINGS: Final = (
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 Injector = Callable[[Mapping[str, psutil.Process]], None]
 """Injects the fault; its argument has the processes of the run by role, with the conductor."""
-CONDUCTOR: Final = "conductor"
 ROLES: Final = (*WORKERS, "recorder")
-EACH: Final = one_per_process(ROLES)
 DUE: Final = "the fault is due at "
 PROCESSES: Final = "processes: "
 FILE: Final = "fault_log.pickle"
@@ -60,8 +61,10 @@ class FaultTimes(NamedTuple):
 
     services_leave_s: float = 30.0
     """Time after which remaining services count as hung."""
-    conductor_ends_s: float = 120.0
-    """Time after which the conductor counts as hung."""
+    due_s: float = 900.0
+    """Time within which the fault is due."""
+    conductor_ends_s: float = 600.0
+    """Time from the fault after which the conductor counts as hung; planning waits for findings for 120 s of simulated time."""
 
 
 TIMES: Final = FaultTimes()
@@ -74,7 +77,7 @@ class FaultRun(NamedTuple):
     wallclock: bool = False
     rate: float = 1.0
     """Simulated per wall time in wall-clock mode."""
-    groups: Groups = EACH
+    groups: Groups = one_per_process(ROLES)
     phase: int = ExamState.PHASE_SCAN
     """Phase of the fault; while scanning, the indenter slides at depth."""
     at_s: float = LIMITS.at_depth_s
@@ -118,6 +121,8 @@ class FaultLog:
     """Time from the fault to the first sign."""
     outcome: CaseOutcome | None = None
     """Outcome, if it was known before the run ended."""
+    sent: bool = False
+    """True once a lie has changed a message or kept one back."""
 
     def add(self, progress: RunProgress, after_ms: float) -> None:
         """Add the new signs, seen `after_ms` after the fault."""
@@ -187,14 +192,16 @@ def sustained_rate(reserve: bool = False) -> float:
 def inject_fault(run: FaultRun, inject: Injector, namespace: str = "") -> FaultResult | None:
     """Run a short examination, in a network `namespace` if it is given, and inject the fault when it is due.
 
-    Returns None if it never was: on a busy machine a run in wall-clock mode may be stopped before contact.
+    Returns None if the run ended before: on a busy machine one in wall-clock mode may be stopped before contact. Raises RunError
+    if the fault is not due within `TIMES.due_s`.
     """
     program = "from palpate_benchmarks.injection import serve; serve()"
     arguments = [sys.executable, "-c", program, TypeAdapter(FaultRun).dump_json(run).decode()]
     if namespace:
         arguments = ["ip", "netns", "exec", namespace, *arguments]
-    output = run.folder / "logs" / f"{CONDUCTOR}.log"
+    output, written = run.folder / "logs" / f"{CONDUCTOR}.log", run.folder / FILE
     output.parent.mkdir(parents=True, exist_ok=True)
+    written.unlink(missing_ok=True)  # of an attempt before this one
     with output.open("w") as stderr:
         child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
     assert child.stdout is not None
@@ -206,15 +213,18 @@ def inject_fault(run: FaultRun, inject: Injector, namespace: str = "") -> FaultR
         conductor_hung.set()
         child.kill()
 
-    alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
+    alarm = threading.Timer(TIMES.due_s, end_hanging)
+    alarm.start()
     try:
         for line in child.stdout:
             if line.startswith(PROCESSES):
                 sockets, pids = TypeAdapter(tuple[Path, dict[str, int]]).validate_json(line.removeprefix(PROCESSES))
                 processes = {CONDUCTOR: psutil.Process(child.pid), **{role: psutil.Process(pid) for role, pid in pids.items()}}
             elif line.startswith(DUE):
+                alarm.cancel()
                 injected_s = float(line.removeprefix(DUE))
                 inject(processes)
+                alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
                 alarm.start()
         child.wait()
     finally:
@@ -229,16 +239,27 @@ def inject_fault(run: FaultRun, inject: Injector, namespace: str = "") -> FaultR
     hung = [role for role, process in services.items() if process in left and process.status() != psutil.STATUS_STOPPED]
     for process in left:
         process.kill()
-    log: FaultLog | None = None
-    with suppress(FileNotFoundError):
-        log = pickle.loads((run.folder / FILE).read_bytes())
+    log: FaultLog | None = pickle.loads(written.read_bytes()) if written.exists() else None
     if log is not None and log.result.interrupted:
         raise KeyboardInterrupt
     if not injected_s:
+        if conductor_hung.is_set():
+            awaited = f"phase {Phase(run.phase).name} of the examination" if processes else "the start of the services"
+            raise RunError(f"the fault was not due within {TIMES.due_s:g} s: waited for {awaited}; see {output}")
         print(f"the fault was never due: {log and log.result.failure}", file=sys.stderr)
         return None
     status = None if conductor_hung.is_set() else child.wait()
     return FaultResult(run.folder, sockets, status, log, injected_s, hung)
+
+
+def logged(folder: Path, message: str) -> str:
+    """Return the service and the text of the first `message` (`code: %s`) in the logs of a run; empty without one."""
+    code = message.partition(" ")[0]
+    for path in sorted((folder / "logs").glob("*.log")):
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            if code in line:
+                return f"{path.stem}: {code.replace('_', ' ')} {line.partition(code)[2].strip()}"
+    return ""
 
 
 class FaultWatch:

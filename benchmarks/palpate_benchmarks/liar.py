@@ -9,7 +9,7 @@ A sensor lies in all its topics.
 |---|---|
 | `frozen`, `zero`, `nan`, `infinite` | the value at the moment; 0; NaN; infinity |
 | `gain`, `sign` | times the amount; minus the value |
-| `bias`, `drift`, `spike` | plus the amount; plus the amount per second; plus the amount in one message per second |
+| `bias`, `drift`, `spike` | plus the amount; plus the amount per second; plus the amount in the first message of each second |
 | `noise`, `dead`, `stuck` | plus white noise with the amount as its deviation; this noise alone; it around the present value |
 | `permuted` | the values of neighbouring joints |
 | `swapped`, `unnormalised` | a quaternion as w x y z; times the amount |
@@ -17,23 +17,27 @@ A sensor lies in all its topics.
 | `repeated`, `disordered`, `stale` | the message of the moment; every second one an older one; the stamp is the amount [s] old |
 """
 
+import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from itertools import islice
+from math import floor
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create as create_service
-from palpate_bus.messages import NS, Message, nanoseconds, time_message
+from palpate_bus.messages import MS, NS, Message, nanoseconds, time_message
 from palpate_bus.messages.fields import numbers
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.scenario.schema import Services
 
 VARIABLE: Final = "PALPATE_LIE"
+INJECTED: Final = "fault_injected: %s"
+"""Log message of a service once it has sent a message with its fault, or kept one back."""
 WHOLE: Final = "message"
 TWINS: Final = {"ft/wrench": "robot/status", "joint_states": "robot/status"}
 """Topics whose fields another one repeats: a lie of the sensor is in both."""
@@ -48,7 +52,7 @@ CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
     "sign": lambda x, first, amount, s: -x,
     "bias": lambda x, first, amount, s: x + amount,
     "drift": lambda x, first, amount, s: x + amount * s,
-    "spike": lambda x, first, amount, s: x + amount if s % 1.0 < 1e-9 else x,
+    "spike": lambda x, first, amount, s: x + amount,
     "noise": lambda x, first, amount, s: np.asarray(x + amount * _RANDOM.standard_normal(x.shape)),
     "dead": lambda x, first, amount, s: np.asarray(amount * _RANDOM.standard_normal(x.shape)),
     "stuck": lambda x, first, amount, s: np.asarray(first + amount * _RANDOM.standard_normal(x.shape)),
@@ -58,8 +62,9 @@ CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
 }
 """Changed values from: the true ones, those at the moment, the amount, and the time since the moment [s]."""
 NOISES: Final = ("noise", "dead", "stuck")
-ORDER_KINDS: Final = ("late", "repeated", "disordered", "stale")
-KINDS: Final = (*CHANGES, "delayed", *ORDER_KINDS)
+OLDER_KINDS: Final = ("delayed", "late", "disordered")
+"""Kinds that send older messages."""
+KINDS: Final = (*CHANGES, "delayed", "late", "repeated", "disordered", "stale")
 
 
 class Lie(NamedTuple):
@@ -97,51 +102,76 @@ class LyingTopic:
     """The lie in one topic."""
 
     def __init__(self, lie: Lie) -> None:
-        self._lie = lie
-        self._past: deque[tuple[int, Message]] = deque(maxlen=1000)
+        self._lie, self._at = lie, round(lie.at_s * NS)
+        self._past: deque[tuple[int, Message]] = deque()
+        """Times [ns] and messages, oldest first, as far back as the lie needs them."""
         self._first: Message | None = None
-        self._sent_until, self._odd = 0, False
+        self._spikes, self._odd = 0, False
+        self.sent = False
+        """True once a message was changed or kept back."""
 
     def messages(self, t: int, sent: list[Message], event: bool) -> list[Message]:
-        """Return the messages to send at `t` [ns] instead of `sent`."""
-        lie = self._lie
-        if lie.kind not in (*ORDER_KINDS, "delayed"):
-            return sent if t < lie.at_s * NS else [self._changed(t, message) for message in sent]
-        self._past.extend((t, message) for message in sent)
-        if t < lie.at_s * NS:
-            return sent
-        if lie.kind == "late" and event:
-            late = t - round(lie.amount * 1e6)
-            due = [message for stamp, message in self._past if stamp <= late and stamp >= self._sent_until]
-            self._sent_until = late + 1
-            return due
-        return [self._ordered(t, message) for message in sent]
+        """Return the messages to send at `t` [ns] instead of `sent`; call it in every step for an event topic."""
+        if self._lie.kind == "late" and event:
+            return sent if t < self._at else self._late(t, sent)
+        return [self._message(t, message) for message in sent]
 
-    def _ordered(self, t: int, message: Message) -> Message:
-        lie = self._lie
+    def _late(self, t: int, sent: list[Message]) -> list[Message]:
+        """Keep the messages of an event topic back; return those that are due, each once."""
+        self.sent = self.sent or bool(sent)
+        self._past.extend((t, message) for message in sent)
+        due = []
+        while self._past and self._past[0][0] <= t - self._lie.amount * MS:
+            due.append(self._past.popleft()[1])
+        return due
+
+    def _message(self, t: int, message: Message) -> Message:
+        if self._lie.kind in OLDER_KINDS:
+            self._past.append((t, message))
+            while len(self._past) > 3 and self._past[1][0] <= t - self._lie.amount * MS:
+                self._past.popleft()
+        if t < self._at:
+            return message
+        lied = self._lied(t, message)
+        self.sent = self.sent or not _equal(lied, message)
+        return lied
+
+    def _lied(self, t: int, message: Message) -> Message:
+        lie, past = self._lie, self._past
+        self._first = self._first or message
+        if lie.kind in CHANGES:
+            return self._changed(message, self._first, (t - self._at) / NS)
         if lie.kind == "repeated":
-            self._first = self._first or message
             return self._first
-        if lie.kind == "disordered":
-            self._odd = not self._odd
-            return self._past[-3][1] if self._odd and len(self._past) > 2 else message
         if lie.kind == "stale":
             return shift_stamp(message, -lie.amount)
-        old = [one for stamp, one in self._past if stamp <= t - lie.amount * 1e6] or [self._past[0][1]]
-        return old[-1] if lie.kind == "late" else fill(message, lie.field, numbers(old[-1], lie.field))
+        if lie.kind == "disordered":
+            self._odd = not self._odd
+            return past[-3][1] if self._odd and len(past) > 2 else message
+        old = next((one for stamp, one in reversed(past) if stamp <= t - lie.amount * MS), past[0][1])
+        return old if lie.kind == "late" else fill(message, lie.field, numbers(old, lie.field))
 
-    def _changed(self, t: int, message: Message) -> Message:
+    def _changed(self, message: Message, first: Message, seconds: float) -> Message:
+        """Return the message changed `seconds` after the moment."""
         lie = self._lie
-        self._first = self._first or message
+        if lie.kind == "spike":
+            spikes = floor(seconds) + 1
+            if spikes == self._spikes:
+                return message
+            self._spikes = spikes
         if lie.field == "data":  # the pixels of an image
-            pixels, first = message.data.view(np.float32), self._first.data.view(np.float32)
-            changed = CHANGES[lie.kind](pixels, first, lie.amount, t / NS - lie.at_s)
-            return replace(message, data=np.asarray(changed, np.float32).view(np.uint8))
+            pixels = CHANGES[lie.kind](message.data.view(np.float32), first.data.view(np.float32), lie.amount, seconds)
+            return replace(message, data=np.asarray(pixels, np.float32).view(np.uint8))
         changed = message
         for path in lie.field.split(","):
-            values = CHANGES[lie.kind](numbers(message, path), numbers(self._first, path), lie.amount, t / NS - lie.at_s)
-            changed = fill(changed, path, values)
+            changed = fill(changed, path, CHANGES[lie.kind](numbers(message, path), numbers(first, path), lie.amount, seconds))
         return changed
+
+
+def _equal(one: Message, other: Message) -> bool:
+    """Return True if all numbers in two messages are equal."""
+    names = (field.name for field in fields(one))
+    return all(np.array_equal(numbers(one, name), numbers(other, name), equal_nan=True) for name in names)
 
 
 def shift_stamp(message: Message, seconds: float) -> Message:
@@ -161,8 +191,7 @@ def _with(value: Any, path: list[str], values: Iterator[float]) -> Any:
     if path:
         return replace(value, **{path[0]: _with(getattr(value, path[0]), path[1:], values)})
     if is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in fields(value) if not field.name.startswith("__")]
-        return replace(value, **{name: _with(getattr(value, name), [], values) for name in names})
+        return replace(value, **{field.name: _with(getattr(value, field.name), [], values) for field in fields(value)})
     if isinstance(value, np.ndarray):
         return np.fromiter(islice(values, value.size), float, value.size).astype(value.dtype)
     return value if isinstance(value, str) else type(value)(next(values))
@@ -178,8 +207,9 @@ def _in(lie: Lie, topic: str) -> Lie:
 class Liar(Service):
     """Wraps a service; see the module's description."""
 
-    def __init__(self, service: Service, lie: Lie) -> None:
-        self._service = service
+    def __init__(self, service: Service, lie: Lie, on_sent: Callable[[], None]) -> None:
+        """`on_sent` is called once, when the first message is changed or kept back."""
+        self._service, self._on_sent, self._sent = service, on_sent, False
         self.role = service.role  # type: ignore[misc]  # that of the wrapped service
         self.catches_up = service.catches_up  # type: ignore[misc]
         self._lying = {topic: LyingTopic(_in(lie, topic)) for topic in lie.topics}
@@ -204,17 +234,19 @@ class Liar(Service):
     def _lied(self, t: int, outbox: Outbox) -> Outbox:
         lied = dict(outbox)
         for topic, lying in self._lying.items():
-            event = contract().topics[topic].event
-            if topic in lied:
-                sent = lied[topic]
-                messages = lying.messages(t, sent if isinstance(sent, list) else [sent], event)
+            event, sent = contract().topics[topic].event, outbox.get(topic, [])
+            if messages := lying.messages(t, sent if isinstance(sent, list) else [sent], event):
                 lied[topic] = messages if event else messages[0]
-            elif event and (late := lying.messages(t, [], event)):
-                lied[topic] = late
+            else:
+                lied.pop(topic, None)
+        if not self._sent and any(lying.sent for lying in self._lying.values()):
+            self._sent = True
+            self._on_sent()
         return lied
 
 
 def create(scenario: Any) -> Service:
     """Return the liar of the environment's lie."""
     lie = Lie.parse(os.environ[VARIABLE])
-    return Liar(create_service(lie.role, getattr(Services(), lie.role, "default"), scenario), lie)
+    service = create_service(lie.role, getattr(Services(), lie.role, "default"), scenario)
+    return Liar(service, lie, lambda: logging.getLogger(__name__).warning(INJECTED, lie))

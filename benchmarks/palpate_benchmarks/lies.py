@@ -1,12 +1,12 @@
 """Campaign of lies: one short examination per lie of a service (`liar`), against its twin without the lie.
 
 Cases are made from the contract: each topic that a service reads, each field with a unit or a code, each kind of lie that fits
-it, at rest, in descent, at depth and in transfer. A case is good if the true force kept its limit, the examination did not call
-itself complete on less than its twin felt, and the liar was named, or did no harm, or sends what no other input contradicts
-(`UNDETECTABLE`).
+it, at rest, in descent, at depth and in transfer; `left_out` has the other topics and fields. A case is good if the lie was sent,
+the true force kept its limit, the examination did not call itself complete on less than its twin felt, and the liar was named, or
+did no harm, or sends what no other input contradicts (`UNDETECTABLE`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from random import Random
@@ -21,8 +21,8 @@ from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, CaseResult, FaultCase
-from palpate_benchmarks.injection import FaultLog, examination, signs_of, sustained_rate
-from palpate_benchmarks.liar import WHOLE, Lie
+from palpate_benchmarks.injection import FaultLog, examination, logged, signs_of, sustained_rate
+from palpate_benchmarks.liar import INJECTED, WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.messages import MS, NS, ExamState, nanoseconds
 from palpate_bus.messages.fields import leaves
@@ -34,15 +34,36 @@ from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input
 
 MOMENTS: Final = ("rest", "descent", "depth", "transfer")
-BEFORE_STROKES: Final = (
-    "camera/depth/image_raw", "camera/depth/camera_info", "perception/surface", "perception/targets",
-    "planning/camera_trigger", "tf_static",
-)  # fmt: skip
-"""Topics that are sent before the first stroke alone: they lie from rest on."""
+BEFORE_STROKES: Final = {
+    "tf_static": 1, "planning/camera_trigger": 1, "camera/depth/image_raw": 2, "camera/depth/camera_info": 2,
+    "perception/surface": 1, "perception/targets": 1,
+}  # fmt: skip
+"""Number of messages of the topics that are sent before the first stroke alone: they lie from rest on."""
+SENT: Final = {**BEFORE_STROKES, "exam/correction": 1, "assessment/findings": 1}
+"""Number of messages of the topics that are sent rarely."""
+NEEDED: Final = {"frozen": 2, "delayed": 2, "repeated": 2, "disordered": 3}
+"""Number of messages without which a lie changes none."""
 SENSED: Final = ("ft/wrench", "joint_states", "robot/status", "control/joint_torque", "planning/setpoint", "sim/contact_wrench")
 """Topics that lie at every moment; the others at one of them in turn."""
-CODES: Final = frozenset({"phase", "mode", "level", "state", "cause", "in_contact", "steady", "target_index", "final"})
-"""Fields without a unit that readers act on."""
+_HELD: Final = (("frozen", 0.0), ("zero", 0.0))
+CODES: Final[Mapping[str, Sequence[tuple[str, float]]]] = {
+    **dict.fromkeys(("phase", "mode", "target_index", "in_contact", "steady", "final", "end_tick"), _HELD),
+    **dict.fromkeys(("level", "state", "cause"), (("bias", 1.0), ("bias", 2.0))),
+}
+"""Fields without a scale that readers act on, and their lies; level, state and cause are 0 in an examination without a lie."""
+OBEYED: Final = (
+    ("perception/targets", "lines", "zero", 0.0),
+    ("planning/camera_trigger", "frames", "zero", 0.0),
+    ("planning/setpoint", "valid_for", "zero", 0.0),
+    ("control/joint_torque", "valid_for", "zero", 0.0),
+    ("exam/state", "stroke", "zero", 0.0),
+    ("exam/state", "force_limited", "bias", 1.0),
+    ("exam/state", "patient_moved", "bias", 1.0),
+    ("supervisor/state", "releases", "bias", 1.0),
+)
+"""Further fields that readers act on, each with one lie."""
+CONSTANT: Final = frozenset({"k", "radius", "stiffness", "damping_ratio"})
+"""Fields that are the same in every message of the examination."""
 JOINTS: Final = frozenset({"position", "velocity", "effort", "applied_torque", "torque", "joint_position", "joint_velocity"})
 """Fields with a number per joint."""
 AMOUNTS: Final = {"N": 5.0, "N m": 0.5, "rad": 0.05, "rad/s": 0.2, "m": 0.03, "m/s": 0.1, "1": 0.3, "px": 20.0, "N/m": 500.0}
@@ -58,6 +79,8 @@ LIVE_KINDS: Final = ("zero", "stale")
 class LieTuning(NamedTuple):
     """Times of a lie's case, and limits of its outcome."""
 
+    rest_s: float = 0.3
+    """Simulated time at rest; the camera burst is triggered at 0.4 s."""
     min_share: float = 0.9
     """Share of the twin's targets that a complete examination has felt."""
     same_background: float = 0.25
@@ -73,11 +96,18 @@ class LieTuning(NamedTuple):
 
 LIES: Final = LieTuning()
 LEFT_OUT: Final = {
-    "assessment/samples": "only a search reads it",
-    "exam/request": "only a search sends it",
-    "assessment/findings": "planning reads only whether they are final",
-}
-"""Topics without cases, or of which only the codes have some, and why."""
+    "only a search reads it": ("assessment/samples",),
+    "planning reads only whether they are final": ("assessment/findings findings", "assessment/findings candidates"),
+    "compared with the image, or not read": ("camera/",),
+    "only observers read it": (
+        "robot/status commands_rejected", "sim/surface normals", "sim/surface breathing", "perception/surface triangles",
+        "perception/targets frames_fused", "exam/state target_count", "exam/state targets_skipped", "exam/state view_blocked",
+        "exam/state reason", "supervisor/state refusals",
+    ),
+    "read only without targets": ("perception/targets reason",),
+    "constant": ("sim/surface triangles",),
+}  # fmt: skip
+"""Reasons why topics, and fields that have neither unit nor code, have no cases; by how `topic field` begins."""
 _STATE = "the simulation's own state, which hardware does not send"
 UNDETECTABLE: Final = (
     ("sim/tool_state", "", _STATE),
@@ -105,44 +135,68 @@ class Healthy(NamedTuple):
 def cells() -> Iterator[tuple[Topic, str, str, float]]:
     """Yield topic, field, kind and amount of every lie that fits the contract."""
     for topic in contract().topics.values():
-        why = left_out(topic)
-        if why and not _codes(topic):
+        if without_cases(topic):
             continue
-        for path in (*(() if why else (*topic.units, *_quaternions(topic))), *_codes(topic)):
+        for path in _paths(topic):
             yield from ((topic, path, kind, amount) for kind, amount in _kinds(topic, path))
         if topic.name == "perception/motion":
             yield from ((topic, "displacement,forecast", kind, FACTORS.get(kind, 0.0)) for kind in ("sign", "gain", "zero"))
-        if not topic.latched and not why:
+        if not topic.latched:
             yield from ((topic, WHOLE, "late", float(delay)) for delay in DELAYS_MS)
             stamped = any(leaf.path.startswith("header.") for leaf in leaves(topic.type))
             kinds = ("repeated", "disordered", *(("stale",) if stamped else ()))
             yield from ((topic, WHOLE, kind, FACTORS.get(kind, 0.0)) for kind in kinds)
+    yield from ((contract().topics[name], path, kind, amount) for name, path, kind, amount in OBEYED)
 
 
-def left_out(topic: Topic) -> str:
-    """Return why the fields of a topic have no cases; empty if they have."""
+def _changes_a_message(topic: Topic, path: str, kind: str, amount: float) -> bool:
+    """Return False for a lie that changes no message of the examination, or is that of a shorter delay."""
+    if kind == "late":
+        return amount in {-(-delay // topic.period_ms): delay for delay in reversed(DELAYS_MS)}.values()
+    if path in CONSTANT and kind in ("frozen", "delayed"):
+        return False
+    return NEEDED.get(kind, 1) <= SENT.get(topic.name, 3)
+
+
+def without_cases(topic: Topic) -> str:
+    """Return why a topic has no cases; empty if it has."""
     if topic.producer not in WORKERS:
         return "its sender takes part in some runs only, or observes"
-    read = any(edge.blocking or edge is Edge.LATCHED for edge in topic.readers.values()) or topic.name in liar.TWINS
-    return LEFT_OUT.get(topic.name, "") if read else "no service reads it"
+    if topic.name not in liar.TWINS and not any(edge.blocking or edge is Edge.LATCHED for edge in topic.readers.values()):
+        return "no service reads it"
+    return next((reason for reason, begins in LEFT_OUT.items() if topic.name in begins), "")
 
 
-def _quaternions(topic: Topic) -> list[str]:
-    paths = (leaf.path for leaf in leaves(topic.type))
-    return list(dict.fromkeys(path[:-2] for path in paths if path.endswith(("orientation.w", "rotation.w"))))
+def left_out() -> dict[str, str]:
+    """Return why topics and fields (`topic field`) have no cases. The liar changes no texts; stamps change with their message."""
+    lying = {f"{topic.name} {one}." for topic, path, *_ in cells() for one in path.split(",")}
+    out = {}
+    for topic in contract().topics.values():
+        if why := without_cases(topic):
+            out[topic.name] = why
+            continue
+        for leaf in leaves(topic.type):
+            covered = f"{topic.name} {leaf.path}.".startswith(tuple(lying))
+            if not covered and leaf.base != "string" and "header." not in leaf.path:
+                said = f"{topic.name} {leaf.path.split('.')[0]}"
+                out[said] = next((reason for reason, begins in LEFT_OUT.items() if said.startswith(begins)), "")
+    return out
 
 
-def _codes(topic: Topic) -> list[str]:
-    read = topic.producer in WORKERS and any(edge.blocking for edge in topic.readers.values())
-    return [] if not read else [leaf.path for leaf in leaves(topic.type) if leaf.path in CODES and leaf.path not in topic.units]
+def _paths(topic: Topic) -> Iterator[str]:
+    """Yield the fields that have a unit, are quaternions or have a code; of findings those with a code."""
+    paths = [leaf.path for leaf in leaves(topic.type)]
+    quaternions = dict.fromkeys(path[:-2] for path in paths if path.endswith(("orientation.w", "rotation.w")))
+    codes = (path for path in paths if path in CODES and path not in topic.units)
+    yield from (*(() if topic.name == "assessment/findings" else topic.units), *quaternions, *codes)
 
 
 def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
     if path.endswith(("orientation", "rotation")):
         yield from (("frozen", 0.0), ("nan", 0.0), ("swapped", 0.0), ("unnormalised", FACTORS["unnormalised"]))
         return
-    if path in CODES or path == "end_tick":
-        yield from (("frozen", 0.0), ("zero", 0.0))
+    if path in CODES:
+        yield from CODES[path]
         return
     bias = AMOUNTS.get(topic.units[path].split(",")[0], 0.3)
     yield from (("zero", 0.0), ("nan", 0.0), ("infinite", 0.0), ("gain", FACTORS["gain"]), ("sign", 0.0), ("bias", bias))
@@ -165,6 +219,8 @@ def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
     seen: set[tuple[str, str]] = set()
     for topic, path, kind, amount in cells():
         moments = ["rest"] if topic.name in BEFORE_STROKES else [next(turn)]
+        if not _changes_a_message(topic, path, kind, amount):
+            continue  # after its turn, so that the other cases keep their moments
         if topic.name in SENSED:
             moments += [moment for moment in MOMENTS if moment not in moments]
         for k, moment in enumerate(moments):
@@ -183,12 +239,16 @@ def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
 
 
 def draw_lies(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield `count` random lies: a cell, an amount of 0.1 to 3 times its own, and a share of the twin's time."""
-    draw, known = Random(seed), list(cells())
+    """Yield `count` random lies: a cell, an amount of 0.1 to 3 times its own, and a share of the twin's time.
+
+    A topic that is sent before the strokes alone lies from rest on.
+    """
+    draw, known = Random(seed), [cell for cell in cells() if _changes_a_message(*cell)]
     for _ in range(count):
         topic, path, kind, amount = draw.choice(known)
         amount = float(f"{amount * 10 ** draw.uniform(-1, 0.5):.2g}")
-        target = f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}"
+        share = f"{draw.uniform(0, 0.9):.3f}"
+        target = f"{topic.name} {path} {kind} {amount:g} {'rest' if topic.name in BEFORE_STROKES else share}"
         yield FaultCase(LIE, target, draw.choice(modes) == "wallclock")
 
 
@@ -200,8 +260,10 @@ def lie_of(target: str, healthy: Healthy) -> Lie:
 
 
 def start_s(lie: Lie) -> float:
-    """Return the simulated time at which a case is forked."""
-    return max(lie.at_s - (LIES.before_s if lie.kind in (*liar.ORDER_KINDS, "delayed") else 0.0), 0.0)
+    """Return the simulated time at which a case is forked; latched messages are sent before any."""
+    if contract().topics[lie.topic].latched:
+        return 0.0
+    return max(lie.at_s - (LIES.before_s if lie.kind in liar.OLDER_KINDS else 0.0), 0.0)
 
 
 def undetectable(lie: Lie) -> str:
@@ -224,8 +286,8 @@ class Lockstep:
     def judged(self, result: CaseResult, lie: Lie) -> CaseResult:
         """Return the result, judged by an examination with the lie; the times of the lies must not decrease."""
         start = round(start_s(lie) * 1e3) * MS
-        if start > self._run.t and not contract().topics[lie.topic].latched:
-            self._run.run(lambda: None, start)
+        if start > self._run.t:
+            self._run.run(lambda: None, start - MS)
         try:
             return run_guarded(str(lie), lambda: judge(result, lie, self._finished(lie), self.twin), LIES.case_s)
         except RunError as error:  # one case must not end the campaign
@@ -237,9 +299,13 @@ class Lockstep:
         run, collected = self._run, self._collector.collected
         log = FaultLog(RunResult("composed", collected))
         since = LIES.never_ns if lie is None else lie.at_s * NS
+
+        def on_sent() -> None:
+            log.sent = True
+
         if lie is not None:
             stepper = run.steppers[lie.role]
-            stepper.service = liar.Liar(stepper.service, lie)
+            stepper.service = liar.Liar(stepper.service, lie, on_sent)
 
         def end() -> int | None:
             if run.t >= since and not run.t % (10 * MS):
@@ -268,9 +334,11 @@ def by_wall_clock(lie: Lie, folder: Path, settings: Sequence[str]) -> FaultLog:
 
     with set_environment({liar.VARIABLE: str(lie)}):
         scenario = examination((*settings, f"services.{lie.role}={liar.__file__}"))
-        log.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=sustained_rate()))
+        timing = Timing(wallclock=True, rate=sustained_rate(), limit=LIES.longest_ns)
+        log.result = run_distributed(scenario, folder, on_progress, (), timing)
     if log.result.interrupted:
         raise KeyboardInterrupt  # ends the campaign, not the case alone
+    log.sent = bool(logged(folder, INJECTED))
     return log
 
 
@@ -292,7 +360,7 @@ def moments_of(exam_states: Sequence[Any]) -> dict[str, float]:
 
     touched = next(t for t, state in states if state.in_contact)
     return {
-        "rest": 0.5,
+        "rest": LIES.rest_s,
         "descent": (begin(ExamState.PHASE_INDENT) + touched) / 2,
         "depth": begin(ExamState.PHASE_SCAN) + LIMITS.at_depth_s,
         "transfer": begin(ExamState.PHASE_RETRACT) + LIMITS.at_depth_s,
@@ -312,7 +380,8 @@ def run_lies(todo: Sequence[FaultCase], folder: Path, settings: Sequence[str] = 
     twin = lockstep.twin
     for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.target, twin)))):
         begin, lie = monotonic(), lie_of(case.target, twin)
-        result = CaseResult(case.kind, case.target, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
+        result = case.result()
+        result.injected_s = round(lie.at_s, 3)
         if case.wallclock:
             result = judge(result, lie, by_wall_clock(lie, (folder / case.name).resolve(), settings), twin)
         else:
@@ -340,4 +409,6 @@ def judge(result: CaseResult, lie: Lie, log: FaultLog, twin: Healthy) -> CaseRes
     enter(result, log, lie.topics, lie.at_s * NS)
     if not result.named and (reason := undetectable(lie)):
         result.named, result.undetectable, result.sign = True, True, f"not detectable: {reason}"
+    if not log.sent:
+        result.injected_s, result.ended = None, f"the lie was not sent: no message was changed; {result.ended}"
     return result

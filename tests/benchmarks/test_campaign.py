@@ -11,11 +11,13 @@ import pytest
 from conductor_messages import collected, result
 from toy_runs import toy_services
 
-from palpate_benchmarks.campaign import draw_cases, judge, prepare, run_case
+from palpate_benchmarks import injection
+from palpate_benchmarks.campaign import cases, draw_cases, judge, prepare, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
-from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch, examination
-from palpate_bus.contract import contract
+from palpate_benchmarks.injection import ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultTimes, FaultWatch, examination
+from palpate_benchmarks.liar import INJECTED
+from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.messages import NS, ExamState, codec, nanoseconds
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode
@@ -79,6 +81,9 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
 
 def judged(log: FaultLog | None, folder: Path, kind: str, where: str, status: int = 0) -> CaseResult:
     case = CaseResult(kind, where, "lockstep")
+    if log is not None:
+        (folder / "logs").mkdir()
+        (folder / "logs" / "planning.log").write_text(f"2026 planning WARNING {INJECTED % where}\n", encoding="utf-8")
     judge(case, FaultResult(folder, folder / "gone", status, log, 8.0), where.split("+"))
     return case
 
@@ -147,6 +152,25 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
     higher, over = {"peak_force_n": 7.1}, {"peak_force_before_n": 14.0, "peak_force_n": 15.5}
     for bad in (higher, over, {"kept": False}, {"left_behind": "/somewhere"}, {"named": False}, {"hung": True}):
         assert not replace(good, **bad).passed
+
+
+def test_a_fault_without_a_message_is_not_injected(tmp_path: Path) -> None:
+    case = CaseResult("nan", "planning/path", "lockstep")
+    judge(case, FaultResult(tmp_path, tmp_path / "gone", 0, FaultLog(result(collected())), 8.0), ["planning/path"])
+    assert case.ended.startswith("the fault was not injected")
+    assert not case.passed
+    known = {(case.kind, case.target) for case in cases(("lockstep",), ("nan", "stamp", "drop"), ())}
+    assert ("nan", "planning/camera_trigger") not in known
+    assert {("drop", "planning/camera_trigger"), ("drop", "assessment/findings")} <= known
+    assert prepare(FaultCase("drop", "planning/path", False), tmp_path, 1.0)[0].phase == ExamState.PHASE_LOOK
+
+
+def test_a_fault_that_is_never_due_ends_its_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(injection, "TIMES", FaultTimes(due_s=0.1, services_leave_s=1.0))
+    case = run_case(FaultCase("nan", "planning/setpoint", wallclock=False), tmp_path)
+    assert "not due within 0.1 s: waited for the start of the services" in case.ended
+    assert case.hung
+    assert not case.passed
 
 
 @pytest.mark.parametrize("named", [True, False])
