@@ -120,8 +120,8 @@ class Run:
     answered_s: float = np.nan
 
 
-def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float = 0.0) -> tuple[Run, Patient]:
-    """Run a scan, then `seconds` [s] of strokes over the region, and a second scan at `again_s` [s]."""
+def run(case: Scenario, seconds: float, again_s: float = 0.0) -> tuple[Run, Patient]:
+    """Run a scan, then `seconds` [s] of strokes over the region; with `again_s` a second scan then [s], the arm out of view."""
     patient, result = Patient(case), Run()
     camera, perception = CameraService(plant_input(case)), PerceptionService(exam_input(case))
     seen, inputs = HandedInbox(), HandedInbox().receive(camera.start())
@@ -135,7 +135,9 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float
         t = k * TICK
         looks = (2, round(10 * again_s)) if again_s else (2,)
         trigger = {"planning/camera_trigger": CameraTrigger(header(t), case.camera.frames)} if k in looks else {}
-        if arm_in_view and t > LOOK_S * NS:
+        if again_s and t >= again_s * NS:
+            q = home
+        elif t > LOOK_S * NS:
             phase = (t / NS - LOOK_S) / 8.0  # a line of 8 s, to and fro
             p = np.array((cx + width * ((0.1 * phase) % 1 - 0.5), cy + height * (abs(2 * (phase % 1) - 1) - 0.5), 0.01))
             q = reach(case, apply(X_WA, p[np.newaxis])[0], q, 1 if t > (LOOK_S + 1) * NS else 10)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate.interface.assessment import Assessment, assess
+from palpate.interface.assessment import assess
 from palpate.recording.faults import FaultCode
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
@@ -47,8 +47,13 @@ def probed(pressed: pd.DataFrame) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def sound(pressed: pd.DataFrame) -> Assessment:
-    return assess(read(pressed, OVER_TIME))
+def sound(pressed: pd.DataFrame) -> np.ndarray:
+    return felt(read(pressed, OVER_TIME))
+
+
+def felt(recording: PalpationRecording) -> np.ndarray:
+    """Return x, y [m] and force [N] of the touches."""
+    return np.array([(*sample.position[:2], sample.force) for sample in recording.samples()]).reshape(-1, 3)
 
 
 def read(table: pd.DataFrame, mapping: Mapping) -> PalpationRecording:
@@ -142,15 +147,12 @@ MAPPED = {
 
 
 @pytest.mark.parametrize(("change", "mapping"), MAPPED.values(), ids=MAPPED)
-def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, sound: Assessment, change, mapping: Mapping) -> None:
+def test_a_correct_mapping_gives_the_same_touches(pressed: pd.DataFrame, sound: np.ndarray, change, mapping: Mapping) -> None:
     recording = read(change(pressed), mapping)
     assert not {fault.code for fault in recording.faults} - {FaultCode.FROZEN}
-    found = assess(recording)
-    place, usual = found.findings.iloc[0], sound.findings.iloc[0]
-    assert np.hypot(place.x_m - usual.x_m, place.y_m - usual.y_m) < 0.005
-    assert usual.ratio_lower < place.ratio < usual.ratio_upper
-    inside = (found.map.apparent > sound.map.lower) & (found.map.apparent < sound.map.upper)
-    assert inside[: len(sound.map.apparent)].mean() > 0.9
+    found = felt(recording)
+    assert found[:, :2] == pytest.approx(sound[:, :2], abs=0.001)
+    assert found[:, 2] == pytest.approx(sound[:, 2], rel=0.03)
 
 
 C = FaultCode
@@ -219,16 +221,25 @@ def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, prob
     assert np.linalg.norm(place - (-0.055, -0.055)) < 0.008
 
 
-@pytest.mark.parametrize(("spoil", "mapping", "code"), SPOILED.values(), ids=SPOILED)
-def test_a_fault_is_named_and_adds_no_finding(
-    pressed: pd.DataFrame, probed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode
-) -> None:
+ASSESSED = ("unlike", "spikes", "probes-one-x", "centimetres-as-millimetres")
+"""Cases that the assessment sees, too; in the last two the places are wrong."""
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_a_fault_is_named_and_adds_no_finding(pressed: pd.DataFrame, probed: pd.DataFrame, name: str) -> None:
+    """No touch that is left is soft, and none away from the lump is much firmer than usual."""
+    spoil, mapping, code = SPOILED[name]
     recording = read(spoil(probed if mapping is PROBES else pressed), mapping)
     fault = next(one for one in recording.faults if one.code is code)
     assert fault.count > 0
     assert fault.text
-    places = assess(recording).findings[["x_m", "y_m"]].to_numpy()
-    assert np.all(np.linalg.norm(places - (-0.055, -0.055), axis=1) < 0.015)
+    touches = felt(recording)
+    places, ratio = touches[:, :2], touches[:, 2] / np.median(touches[:, 2]) if len(touches) else np.empty(0)
+    assert np.all(ratio > 0.4)
+    reach, places = 0.040, places[ratio > 1.4]
+    if name in ASSESSED:
+        reach, places = 0.015, assess(recording).findings[["x_m", "y_m"]].to_numpy()
+    assert np.all(np.linalg.norm(places - (-0.055, -0.055), axis=1) < reach)
 
 
 def test_slides_over_a_body_that_breathes_keep_one_depth() -> None:

@@ -19,8 +19,10 @@ from research.following import READY, Patient, Run, run
 
 
 @cache
-def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: float = 20.0) -> tuple[Run, Patient]:
-    return run(load_scenario(scenario, ("exam.region_m=[0.1, 0.1]", *settings), seed), seconds)
+def breathing(level: str) -> tuple[Run, Patient]:
+    """Return 30 s of strokes over a wall that breathes by 8 mm, with errors of a level."""
+    settings = ("exam.region_m=[0.1, 0.1]", f"errors={level}", "phantom.breathing.peak_to_peak_m=0.008")
+    return run(load_scenario("healthy", settings, 3), 30.0)
 
 
 def test_after_a_long_gap_the_wall_breathes_as_before() -> None:
@@ -61,32 +63,27 @@ def test_the_arm_hides_what_lies_below_it() -> None:
     assert ArmMask(robot).hides(READY, above, rays, np.array((1.2, 1.2))).tolist() == [True, False]
 
 
-def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates() -> None:
-    result, patient = followed("phantom.breathing.peak_to_peak_m=0.008")
-    state, reported = np.array(result.state), np.array(result.motion)
-    assert np.mean(state == SurfaceMotion.QUIET) > 0.9
+@pytest.mark.parametrize("level", ["typical", "poor"])
+def test_quiet_breathing_is_followed_and_the_error_shared_by_neighbouring_pixels_is_reported(level: str) -> None:
+    """The arm palpates. The error of the displacement agrees with the reported SD, with a camera of either kind."""
+    result, patient = breathing(level)
+    reported = np.array(result.motion)
+    assert np.mean(np.array(result.state) == SurfaceMotion.QUIET) > 0.9
     error = reported[:, 2] - [patient.curve.excursion(t + 0.1) for t in result.t_s]
-    assert np.sqrt(np.mean(error**2)) < 0.7e-3
+    assert np.sqrt(np.mean(error**2)) < (0.7e-3 if level == "typical" else 1.2e-3)
     assert np.abs(error).max() < 5e-3
     assert np.ptp(reported[:, 0]) > 4e-3, "it does breathe"
-
-
-@pytest.mark.parametrize("level", ["typical", "poor"])
-def test_the_error_shared_by_neighbouring_pixels_is_reported(level: str) -> None:
-    """Over 50 s the error of the displacement agrees with the reported SD, with a camera of either kind."""
-    result, patient = followed(f"errors={level}", "phantom.breathing.peak_to_peak_m=0.008", seconds=50.0)
-    reported = np.array([displacement[0] for displacement in result.motion])
     lifted = np.array([patient.curve.excursion(t) for t in result.t_s])
-    ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(reported - lifted)
+    ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(reported[:, 0] - lifted)
     assert 0.6 < ratio < 1.6
 
 
 def test_a_camera_that_warms_up_moves_no_wall() -> None:
-    warming = ("exam.region_m=[0.1, 0.1]", "errors.camera.warm_up_m=0.01", "errors.camera.warm_up_s=60")
+    warming = ("exam.region_m=[0.1, 0.1]", "errors.camera.warm_up_m=0.01", "errors.camera.warm_up_s=30")
     case = load_scenario("healthy", warming, 3)
-    result, patient = run(case, 40.0)
+    result, patient = run(case, 24.0)
     t, warmer = np.array(result.t_s), draw_errors(case.errors, case.seed).camera.warm_up_m
-    assert abs(warmer) * (np.exp(-t[0] / 60) - np.exp(-t[-1] / 60)) > 1.5e-3, "it drifts"
+    assert abs(warmer) * (np.exp(-t[0] / 30) - np.exp(-t[-1] / 30)) > 1.5e-3, "it drifts"
     error = np.array(result.motion)[:, 0] - [patient.curve.excursion(at) for at in t]
     assert abs(error[t > t[-1] - 12].mean() - error[t < t[0] + 12].mean()) < 0.5e-3
 
@@ -99,18 +96,19 @@ def bent(outward: np.ndarray, xy: np.ndarray) -> float:
 
 
 def test_what_the_camera_sees_bent_for_seconds_averages_out() -> None:
-    result, patient = followed("errors=typical", "phantom.breathing.peak_to_peak_m=0.008", seconds=50.0)
+    result, patient = breathing("typical")
     p_A = apply(inverse(patient.X_WA), np.asarray(result.surface.vertices, np.float64).reshape(-1, 3))
     n_A = np.asarray(result.surface.normals, np.float64).reshape(-1, 3) @ patient.X_WA[:3, :3]
     skin = TrueSurface(TrueBody(patient.model.vertices, patient.model.triangles, patient.X_WA))
     outward = (skin.height(p_A[:, :2]) - p_A[:, 2]) * n_A[:, 2]
     burst, averaged = bent(outward, p_A[:, :2]), bent(outward - np.asarray(result.correction.outward), p_A[:, :2])
     assert burst > 0.3e-3
-    assert averaged < 0.75 * burst
+    assert averaged < 0.8 * burst
 
 
 def test_a_cough_spoils_and_passes() -> None:
-    result, patient = followed("phantom.breathing.coughs_per_min=6", seed=5, seconds=40.0)
+    case = load_scenario("healthy", ("exam.region_m=[0.1, 0.1]", "phantom.breathing.coughs_per_min=10"), 5)
+    result, patient = run(case, 20.0)
     state, t = np.array(result.state), np.array(result.t_s)
     table = patient.curve.table
     hard = table[(table[:, 1] == 0.15) & (table[:, 4] > 0.012) & (table[:, 0] > t[0]) & (table[:, 0] < t[-1] - 1)]
@@ -121,30 +119,25 @@ def test_a_cough_spoils_and_passes() -> None:
     assert np.mean(state == SurfaceMotion.QUIET) > 0.5
 
 
-@pytest.mark.parametrize("kind", ["shift", "turn"])
-def test_a_patient_who_moves_is_noticed_within_a_second(kind: str) -> None:
-    result, patient = followed(f"phantom.motion.kind={kind}", "phantom.motion.at_s=20", scenario="restless", seconds=12.0)
-    t, state = np.array(result.t_s), np.array(result.state)
-    moved = t[state == SurfaceMotion.MOVED]
-    assert len(moved)
-    assert patient.motion.at_s < moved[0] <= patient.motion.at_s + 1.0
+def moved_at(result: Run) -> float:
+    """Return the time of the first report that the patient has moved [s]."""
+    return float(np.array(result.t_s)[np.array(result.state) == SurfaceMotion.MOVED][0])
 
 
 def test_a_shift_along_a_body_that_is_much_the_same_along_its_length_is_noticed() -> None:
-    settings = ("exam.region_m=[0.12, 0.12]", "phantom.motion.kind=shift", "phantom.motion.at_s=60")
-    result, patient = followed(*settings, scenario="person", seed=2063235108, seconds=50.0)
-    assert abs(patient.motion.pose(70.0)[1, 3]) > 9.9e-3
-    moved = np.array(result.t_s)[np.array(result.state) == SurfaceMotion.MOVED]
-    assert len(moved)
-    assert 60.0 < moved[0] <= 61.5
+    settings = ("exam.region_m=[0.12, 0.12]", "phantom.motion.kind=shift", "phantom.motion.at_s=25")
+    result, patient = run(load_scenario("person", settings, 2063235108), 16.0)
+    assert abs(patient.motion.pose(35.0)[1, 3]) > 9.9e-3
+    assert 25.0 < moved_at(result) <= 26.5
 
 
 @pytest.mark.parametrize("kind", ["shift", "turn"])
-def test_a_second_scan_finds_the_patient_who_moved(kind: str) -> None:
-    case = load_scenario("restless", ("exam.region_m=[0.1, 0.1]", f"phantom.motion.kind={kind}", "phantom.motion.at_s=14"), 3)
-    result, patient = run(case, seconds=18.0, arm_in_view=False, again_s=16.0)
+def test_a_patient_who_moves_is_noticed_within_a_second_and_found_by_a_second_scan(kind: str) -> None:
+    case = load_scenario("restless", ("exam.region_m=[0.1, 0.1]", f"phantom.motion.kind={kind}", "phantom.motion.at_s=16"), 3)
+    result, patient = run(case, seconds=19.0, again_s=18.0)
+    assert 16.0 < moved_at(result) <= 17.0
     assert result.state[-1] == SurfaceMotion.QUIET
-    X = patient.motion.pose(20.0)
+    X = patient.motion.pose(22.0)
     middle = np.append(case.exam.centre_m, 0.0)
     moved = (X[:3, :3] @ middle + X[:3, 3] - middle)[:2]
     assert np.abs(result.shift[-1] - moved)[0] < 1.5e-3
