@@ -184,7 +184,8 @@ class DashboardService(Service):
             inside = lesion == index
             if inside.any():  # half contrast, ignoring other lesions
                 own = np.where(inside | (lesion < 0), ratio, 1.0)
-                outlines.append(level_lines(raised, triangles, own, (1.0 + float(own[inside].max())) / 2.0))
+                extreme = float(own[inside][np.abs(np.log(own[inside])).argmax()])
+                outlines.append(level_lines(raised, triangles, own, (1.0 + extreme) / 2.0))
         self._map.lesions(outlines)
         self._scene.lesions(outlines)
         self._X_WA_initial = pose_matrix(message.pose)

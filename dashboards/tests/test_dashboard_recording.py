@@ -12,7 +12,7 @@ import rerun as rr
 from dashboard_messages import OBSERVED, FakeInbox, Messages, latched, run, write_recording
 from rerun.chunk import RrdReader
 
-from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, header
+from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, PhantomTruth, header
 from palpate_dashboard import replay
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import AWAITED
@@ -124,6 +124,16 @@ def test_the_truth_goes_with_the_patient(recording: Recording) -> None:
         patient = sent()[round(time * 1e9)]["truth/patient"]
         p = patient.pose.position
         assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z + patient.excursion), abs=1e-6)
+
+
+def test_a_soft_lump_is_outlined_where_a_stiff_one_is(recording: Recording, tmp_path: Path) -> None:
+    stiff = latched()["truth/phantom"]
+    share = (stiff.stiffness / stiff.background - 1) / 3
+    softer = (1 - 0.8 * share) * stiff.background
+    soft = PhantomTruth(stiff.surface, softer, stiff.background, stiff.lesion, stiff.pose)
+    drawn = recording, draw(tmp_path, [(0, {"truth/phantom": soft})])
+    outlines = (one.cells("/world/truth/lesions", "LineStrips3D:strips")[0][1].as_py() for one in drawn)
+    np.testing.assert_allclose(*(np.sort(np.reshape(outline, (-1, 3)), axis=0) for outline in outlines), atol=1e-6)
 
 
 def test_the_abdomen_is_written_only_while_it_changes(recording: Recording) -> None:
