@@ -131,8 +131,8 @@ def section(found: pd.DataFrame | None = None) -> PageSection:
         f"{found['person'].nunique()} persons of `phantom.kind: person, build: median`, each pressed at {SETUP.places} random "
         "places of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus "
         "et al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
-        "Ten people determine an SD between people to a quarter, which is the width of the bounds. The people were young, male "
-        "and slim; other builds are not validated."
+        "Ten people determine an SD between people with a standard error of a quarter; its bound is 40 %. The people were young, "
+        "male and slim; other builds are not validated."
     )
     return PageSection("population", "Check of the person sampler", text, checks, lambda f: draw(f, found, people), (7.0, 2.8))
 

@@ -79,8 +79,9 @@ class PressedGrid(NamedTuple):
     fine_pitch_m: float = 0.005
     """Distance of pressed places within `pitch_m` of a lump's outline."""
     reach_m: float = 0.040
-    """A lump is not palpable further outside its outline than this plus its depth: the influence K0(r / l) is below 3 % there,
-    and the felt effect goes with its square."""
+    """A lump is not palpable further outside its outline than this plus its depth: the felt effect goes with the square of the
+    influence K0(r / l) / K0(9 mm / l). There it is 0.3 % for the shortest l of the persons of seeds 1000 to 1099 (13 mm), 0.7 %
+    for the median (17 mm) and 5 % for the longest (35 mm)."""
 
 
 GRID: Final = PressedGrid()

@@ -1,4 +1,4 @@
-/* The breaths of a phantom: how far its wall is lifted, as palpate_models.breathing draws them. */
+/* The breaths of a phantom: how far its wall is lifted, as palpate_models.patient.breathing draws them. */
 #ifndef PALPATE_BREATH_H
 #define PALPATE_BREATH_H
 

@@ -1,4 +1,4 @@
-/* How the contraction of voluntarily guarding muscle comes and goes. The same law as palpate_models.guarding. */
+/* How the contraction of voluntarily guarding muscle comes and goes. The same law as palpate_models.patient.wall. */
 #ifndef PALPATE_GUARDING_H
 #define PALPATE_GUARDING_H
 

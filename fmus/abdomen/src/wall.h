@@ -1,4 +1,4 @@
-/* The wall stiffens with depth. The same law as palpate_models.wall, of which this is the one place here.
+/* The wall stiffens with depth. The same law as palpate_models.patient.wall, of which this is the one place here.
  *
  * `stiffening` is beta [1/m], `straight` the displacement u_c [m] from which the spring that stiffens is straight. */
 #ifndef PALPATE_WALL_H

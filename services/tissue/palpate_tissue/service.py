@@ -161,7 +161,7 @@ class TissueService(Service):
         return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles, np.empty(0, np.float32))
 
     def _indentation(self, t: int, tool: Message | None, f_W: Array) -> Message:
-        """Return depth of the indenter below the rest surface, and the normal and tangential force on it."""
+        """Return depth of the indenter below the unpressed, breathing surface, and the normal and tangential force on it."""
         if tool is None:
             return IndentationTruth(header(t, "world"), self._out_of_reach, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
         under = self._surface.nearest(self._p_A, self.backend.excursion(t / NS))
