@@ -111,7 +111,7 @@ def _with_rectus(patient: FeltPatient) -> FeltPatient:
     x = np.arange(len(patient.force)) * PITCH_M - HALF_M
     beyond = np.abs(np.abs(x) - BAND_M) - 0.8 * BAND_M
     band: Array = BAND_RATIO ** (1 / (1 + np.exp(beyond / 0.0025)))
-    return FeltPatient(patient.force * band, patient.healthy * band)
+    return patient._replace(force=patient.force * band, healthy=patient.healthy * band)
 
 
 def line(row: Disturbance, seeds: range, region: float = REGION_M) -> str:

@@ -63,7 +63,8 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
     x, y = rng.uniform(-0.07, 0.07, 2).tolist()
     lump = Bump(x, y, float(rng.uniform(*RADII_M)))(places).reshape(background.shape)
     contrast = float(np.exp(rng.uniform(*np.log(CONTRASTS)))) if seed % 2 else 1.0
-    return FeltPatient(background * contrast**lump, background), contrast
+    flat = np.zeros_like(background)
+    return FeltPatient(background * contrast**lump, background, height=flat, breathing=flat), contrast
 
 
 def ideal(o: Observations, length: float) -> float:

@@ -37,7 +37,7 @@ from palpate_planning.stroke import (
     travel,
 )
 from palpate_planning.stroke_motion import StrokeMotion
-from palpate_planning.strokes.coverage import strokes, transfer
+from palpate_planning.strokes.coverage import Stroke, strokes, transfer
 from palpate_planning.strokes.path import SurfacePath, frames_along
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
@@ -150,6 +150,8 @@ class QuickExamination:
         self._gated = self._exam.breathing is Following.GATE
         self._open = True
         self._path: SkinPath
+        self._before: Array | None = None
+        """End of the previous stroke, in A as registered [m], shape (2,)."""
         self._zero_m = 0.0
         self._force, self._load, self._touching = 0.0, 0.0, False
         self._depth = -STROKE.hop_height_m
@@ -157,8 +159,15 @@ class QuickExamination:
 
     def run(self) -> list[PeriodRow]:
         """Carry out the examination; return measurements and truth of every period."""
+        return self._drive(self._strokes())
+
+    def press(self, xy: Array, depth_m: float) -> list[PeriodRow]:
+        """Move to a place in A as registered [m], shape (2,), and press there, as requested by a search."""
+        target = np.zeros(1, dtype=np.int64)
+        return self._drive(self._stroke(Stroke(xy[None], target, target), depth_m))
+
+    def _drive(self, stages: Stages[None]) -> list[PeriodRow]:
         rows: list[PeriodRow] = []
-        stages = self._strokes()
         next(stages)
         with suppress(StopIteration):
             while True:
@@ -169,18 +178,21 @@ class QuickExamination:
 
     def _strokes(self) -> Stages[None]:
         """Planning's strokes over all targets, with paths between them."""
-        scan, exam, motion = scan_of(self._exam, self._believed.in_A), self._exam, self._motion
+        scan, exam = scan_of(self._exam, self._believed.in_A), self._exam
         xy = scan.targets
         usable = np.ones(len(xy), dtype=bool)
-        before: Array | None = None
         for stroke in strokes(xy, scan.line_of_target, usable, scan.joined, exam.mode, exam.spacing_m):
-            if before is not None:
-                self._start(self._lay(transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
-                yield from travel(motion, motion.segment.path.length)
-            self._start(self._lay(stroke.xy, stroke.targets, stroke.visits))
-            yield from press(motion, self._descent)
-            yield from lift(motion, lambda t: STROKE.hop_height_m)
-            before = stroke.xy[-1]
+            yield from self._stroke(stroke)
+
+    def _stroke(self, stroke: Stroke, depth_m: float | None = None) -> Stages[None]:
+        motion = self._motion
+        if self._before is not None:
+            self._start(self._lay(transfer(self._before, stroke.xy[0]), stroke.targets[:1], contact=False))
+            yield from travel(motion, motion.segment.path.length)
+        self._start(self._lay(stroke.xy, stroke.targets, stroke.visits, depth_m=depth_m))
+        yield from press(motion, self._descent)
+        yield from lift(motion, lambda t: STROKE.hop_height_m)
+        self._before = stroke.xy[-1]
 
     def _start(self, path: SkinPath) -> None:
         self._path = path
@@ -202,7 +214,9 @@ class QuickExamination:
         """True share of the breathing excursion at each of these points, shape (n,)."""
         return np.asarray(self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2]))
 
-    def _lay(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> SkinPath:
+    def _lay(
+        self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True, depth_m: float | None = None
+    ) -> SkinPath:
         s, p, n, R = frames_along(self._believed, xy, _DOWN)
         visited: Ints = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
         path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
@@ -212,7 +226,7 @@ class QuickExamination:
         believed, outward = self._believed.at(dense)
         place, normal = self._skin.points(dense + self.loop.aside_m)
         return SkinPath(
-            segment=Segment(path, contact=contact),
+            segment=Segment(path, contact=contact, depth_m=depth_m),
             per_m=count / path.length if path.length else 0.0,
             believed_W=believed.tolist(),
             outward_W=outward.tolist(),

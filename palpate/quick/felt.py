@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.signal import fftconvolve
+from scipy.spatial import Delaunay
 from scipy.special import k0, k1
 
 from palpate_models.numerics.frames import Array
@@ -43,15 +44,27 @@ class FeltPatient(NamedTuple):
     """[N], shape (n, n): row by y, column by x, both ascending."""
     healthy: Array
     """The force without lumps [N], shape (n, n)."""
+    height: Array
+    """Height z of the skin at rest [m], shape (n, n)."""
+    breathing: Array
+    """Share of the breathing excursion, shape (n, n)."""
 
     def force_at(self, xy: Array) -> Array:
         """Return the force [N] at places in A's xy plane [m], shape (m, 2) -> (m,)."""
-        return np.asarray(map_coordinates(self.force, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
+        return between(self.force, xy)
 
     def excess_at(self, xy: Array) -> Array:
         """Return the log of the force with lumps over that without, at places in A's xy plane [m], shape (m, 2) -> (m,)."""
-        excess = np.log(self.force / self.healthy)
-        return np.asarray(map_coordinates(excess, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
+        return between(np.log(self.force / self.healthy), xy)
+
+    def skin_at(self, xy: Array) -> Array:
+        """Return the point of the skin at rest at a place [m], shape (2,) -> (3,), in A."""
+        return np.append(xy, between(self.height, xy[None]))
+
+
+def between(grid: Array, xy: Array) -> Array:
+    """Return the values of a grid of `FeltPatient` at places in A's xy plane [m], shape (m, 2) -> (m,)."""
+    return np.asarray(map_coordinates(grid, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
 
 
 def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
@@ -62,16 +75,19 @@ def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
     footprint = _footprint(phantom.stiffness.length_m)
     front = (model.normals[:, 2] > 0.2) & (np.abs(model.vertices[:, :2]) < 1.2 * HALF_M).all(axis=1)
     xy = np.stack(np.meshgrid(axis, axis), axis=-1)
+    mesh = Delaunay(model.vertices[front, :2])
+
+    def raster(values: Array, beyond: float = 0.0) -> Array:
+        return np.nan_to_num(LinearNDInterpolator(mesh, values[front])(xy), nan=beyond)
 
     def felt(modulus: Array) -> Array:
         force = force_at_10_mm(replace(model, stiffness=modulus), phantom.stiffness) * (1 + _TENSION_GAIN * model.tension)
-        raster = np.nan_to_num(
-            LinearNDInterpolator(model.vertices[front, :2], np.log(force[front]))(xy), nan=float(np.log(np.median(force[front])))
-        )
-        padded = np.pad(np.exp(POWER * raster), len(footprint) // 2, mode="edge")
+        log_force = raster(np.log(force), float(np.log(np.median(force[front]))))
+        padded = np.pad(np.exp(POWER * log_force), len(footprint) // 2, mode="edge")
         return np.asarray(fftconvolve(padded, footprint, mode="valid") ** (1 / POWER))
 
-    return FeltPatient(felt(model.stiffness), felt(model.background))
+    forces = felt(model.stiffness), felt(model.background)
+    return FeltPatient(*forces, raster(model.vertices[:, 2]), raster(model.breathing))
 
 
 def _footprint(length: float) -> Array:

@@ -7,8 +7,9 @@ import numpy as np
 
 from palpate.quick.felt import FeltPatient, felt_patient
 from palpate.search.hand import Hand
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, apply
 from palpate_models.numerics.seeds import generator
+from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_search.posterior import Policy, Posterior
@@ -37,7 +38,7 @@ class SearchCase(NamedTuple):
     felt: FeltPatient
     """Apparent stiffness by the standard press."""
     centre: Array | None
-    """Centre of the lump [m], shape (2,); None without one."""
+    """Centre of the lump in the abdomen frame as registered [m], shape (2,); None without one."""
 
 
 def case(seed: int, errors: str = "typical") -> SearchCase:
@@ -58,7 +59,8 @@ def case(seed: int, errors: str = "typical") -> SearchCase:
         felt = felt_patient(scenario.phantom, seed)
         excess = float(felt.excess_at(centre[None])[0])
         low, high = (middle, high) if excess < np.log(TRIAL.contrast) else (low, middle)
-    return SearchCase(scenario, felt, centre)
+    registered = apply(draw_errors(scenario.errors, seed).X_AAt, felt.skin_at(centre))
+    return SearchCase(scenario, felt, registered[:2])
 
 
 class Trial(NamedTuple):
