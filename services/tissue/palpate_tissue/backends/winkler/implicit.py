@@ -7,8 +7,8 @@ The equations of `tissue.py` by backward Euler,
 are solved by projected successive over-relaxation, vertex by vertex, with the springs linearised at the present displacement.
 Only the vertices near the sphere are stepped; those that were near it before follow every `far_s`, or when it returns. Vertices
 that it never came near stay at rest. Against steps of all vertices, displacements are up to 0.12 to 0.30 mm too small and the
-mean force is 0.14 to 0.53 % too large, more for longer Pasternak lengths (persons of seeds 1000 to 1009, three slides of 120 mm at
-10 mm depth on each). `docs/scoring.md` compares forces with those of the explicit steps.
+mean force is 0.14 to 0.53 % too large, more for longer Pasternak lengths (persons of seeds 1000 to 1009, three slides of 120 mm
+at 10 mm depth on each). `docs/scoring.md` compares forces with those of the explicit steps.
 """
 
 from math import sqrt
