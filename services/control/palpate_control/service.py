@@ -32,6 +32,10 @@ class Problem(NamedTuple):
 
 SETPOINT_DISTANCE_MAX_M: Final = 0.1
 """A Cartesian set-point that is farther from the tool does not come from planning, which starts where the arm is."""
+MOVING_RADPS: Final = 0.05
+STANDING: Final = 5
+"""Set-points in a row that repeat a posture while its velocity is above `MOVING_RADPS`. The arm would stay, and planning, which
+waits for it, would blame the torques."""
 NO_PROBLEM: Final = Problem("", "")
 _NONE: Final = np.zeros(0)
 
@@ -69,6 +73,8 @@ class ControlService(Service):
         self._no_validity = duration_message(0)
         self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
+        self._received: Setpoint | None = None
+        self._standing = 0
         self._facts = dict.fromkeys(("setpoints", "setpoints_rejected", "ticks_without_joint_states", "ticks_without_command"), 0)
         self._last = self._still
         self._last_expires = -1
@@ -151,6 +157,13 @@ class ControlService(Service):
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS
             self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {limit:.0f} ms")
+            return
+        before, self._received = self._received, setpoint
+        speed = float(np.abs(setpoint.qd).max())
+        repeats = before is not None and setpoint.stamp > before.stamp and np.array_equal(setpoint.q, before.q)
+        self._standing = self._standing + 1 if repeats and speed > MOVING_RADPS else 0
+        if self._standing >= STANDING:
+            self._refuse(t, f"joint_position stands while joint_velocity is {speed:.2f} rad/s")
             return
         while self._pending and self._pending[-1].stamp >= setpoint.stamp:
             self._pending.pop()  # planning's clock was set back: the newest message counts

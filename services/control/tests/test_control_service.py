@@ -89,6 +89,14 @@ def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
     assert rig.service.finish()["ticks_without_command"] == 31
 
 
+def test_a_posture_that_stands_at_a_velocity_is_blamed_on_the_setpoints(rig: Rig) -> None:
+    for _ in range(31):  # the last accepted one stands until it expires
+        rig.send(setpoint(rig.t, joint_velocity=np.full(7, 0.3)))
+        command = rig.tick(10)
+    assert (valid_for(command), command.culprit) == (0, "planning/setpoint")
+    assert "joint_position stands" in command.problem
+
+
 @pytest.mark.parametrize("state", [{"names": JOINT_NAMES[::-1]}, {"q": HOME[:6]}], ids=["permuted", "one too few"])
 def test_joints_of_another_arm_end_commanding_and_its_setpoints_are_refused(rig: Rig, state: dict[str, Any]) -> None:
     rig.tick()
