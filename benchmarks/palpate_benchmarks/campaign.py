@@ -133,8 +133,8 @@ def run_case(case: FaultCase, folder: Path, settings: tuple[str, ...] = ()) -> C
             ended = inject_fault(run, inject, name)
             if ended is None and case.wallclock:
                 ended = inject_fault(run._replace(rate=sustained_rate(reserve=True)), inject, name)
-    except RunError as error:  # one case must not end the campaign
-        result.hung, reason = True, str(error)
+    except (RunError, psutil.NoSuchProcess) as error:  # one case must not end the campaign
+        reason = str(error)
     result.wall_s = round(monotonic() - begin, 1)
     if ended is None:
         result.ended = f"the fault was not injected: {reason}"

@@ -14,11 +14,10 @@ MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", "corrupt", "truncate", "na
 """Faults in messages; see `palpate_benchmarks.faulty`."""
 SCARCE_KINDS: Final = ("memory", "disk", "starve")
 """Shortages: of memory for a service, of disk space for the recorder, of processor time for all."""
-WHOLE_RUN_KINDS: Final = (*SCARCE_KINDS, "partition")
-"""Kinds that apply to a whole run; so do `kill` and `freeze` of conductor, recorder, dashboard or several roles."""
 LIE: Final = "lie"
-KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *WHOLE_RUN_KINDS, LIE)
-"""All kinds. Process kinds apply to one service, message kinds and `lie` to one topic, except as said above."""
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *SCARCE_KINDS, "partition", LIE)
+"""All kinds. Process kinds apply to one service, message kinds and `lie` to one topic, others to a whole run; so do `kill` and
+`freeze` of conductor, recorder, dashboard or several roles."""
 
 
 class CampaignLimits(NamedTuple):

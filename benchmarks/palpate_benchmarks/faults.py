@@ -63,7 +63,7 @@ def faults(  # noqa: PLR0913 - the options of a command
     changed = tuple(settings or ())
     examination(changed)  # a setting that does not fit ends the command here
     code = sha256("\n".join((code_digest(), *changed)).encode()).hexdigest()[:8]
-    done = {result.identity: result.code for result in found}
+    done = {result.identity: result.code for result in found if result.injected_s is not None}
     if not again:
         todo = [case for case in todo if done.get(case.result().identity) != code]
     todo = sorted(todo, key=lambda case: case.result().identity in done)[:limit]
@@ -83,14 +83,13 @@ def faults(  # noqa: PLR0913 - the options of a command
 
 
 def _load(path: Path) -> list[CaseResult]:
-    """Return the results in a file, without those whose fault was not injected: they are run again."""
+    """Return the results in a file."""
     if not path.exists():
         return []
     try:
-        found = from_csv(path.read_text(encoding="utf-8"))
+        return from_csv(path.read_text(encoding="utf-8"))
     except ValueError as error:
         refuse(f"--out {path}: holds no results of this command: {error}")
-    return [result for result in found if result.injected_s is not None]
 
 
 def table(results: Sequence[CaseResult]) -> Table:

@@ -91,7 +91,6 @@ class LieTuning(NamedTuple):
     """Maximum wall time of a case."""
     before_s: float = 0.25
     """A case of old messages is forked this long before its lie, so that the liar has some."""
-    never_ns: int = 10**18
 
 
 LIES: Final = LieTuning()
@@ -298,7 +297,6 @@ class Lockstep:
         """Run to the end, in a child process."""
         run, collected = self._run, self._collector.collected
         log = FaultLog(RunResult("composed", collected))
-        since = LIES.never_ns if lie is None else lie.at_s * NS
 
         def on_sent() -> None:
             log.sent = True
@@ -308,8 +306,8 @@ class Lockstep:
             stepper.service = liar.Liar(stepper.service, lie, on_sent)
 
         def end() -> int | None:
-            if run.t >= since and not run.t % (10 * MS):
-                log.add(RunProgress(run.t, 1.0, collected), (run.t - since) / 1e6)
+            if lie is not None and run.t >= lie.at_s * NS and not run.t % (10 * MS):
+                log.add(RunProgress(run.t, 1.0, collected), run.t / 1e6 - lie.at_s * 1e3)
             return collected.end_tick
 
         failure: Failure | None

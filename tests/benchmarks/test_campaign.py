@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from conductor_messages import collected, result
 from toy_runs import toy_services
+from typer.testing import CliRunner
 
+from palpate.commands import app_for
 from palpate_benchmarks import injection
 from palpate_benchmarks.campaign import cases, draw_cases, judge, prepare, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, csv_text, from_csv
@@ -24,6 +26,7 @@ from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_conductor.outcome import RunProgress
+from palpate_errors import ExitStatus
 
 TOPIC = contract().topics["control/joint_torque"]
 
@@ -165,11 +168,19 @@ def test_a_fault_without_a_message_is_not_injected(tmp_path: Path) -> None:
     assert prepare(FaultCase("drop", "planning/path", False), tmp_path, 1.0)[0].phase == ExamState.PHASE_LOOK
 
 
+def test_a_row_that_was_not_injected_stays_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "faults.csv"
+    file.write_text(csv_text([CaseResult("kill", "robot", "lockstep", ended="the fault was not injected")]), encoding="utf-8")
+    monkeypatch.setattr("palpate_benchmarks.campaign.run_case", lambda case, *_: replace(case.result(), injected_s=1.0))
+    words = ["faults", "--out", str(file), "--kind", "nan", "--only", "exam/state", "--mode", "lockstep"]
+    assert CliRunner().invoke(app_for("faults"), words).exit_code == ExitStatus.FAILED
+    assert [case.kind for case in from_csv(file.read_text(encoding="utf-8"))] == ["kill", "nan"]
+
+
 def test_a_fault_that_is_never_due_ends_its_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(injection, "TIMES", FaultTimes(due_s=0.1, services_leave_s=1.0))
     case = run_case(FaultCase("nan", "planning/setpoint", wallclock=False), tmp_path)
     assert "not due within 0.1 s: waited for the start of the services" in case.ended
-    assert case.hung
     assert not case.passed
 
 
