@@ -1,6 +1,7 @@
 """A process of an examination is killed or frozen while the indenter is in contact."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import pytest
 from examination import assert_held_and_no_harder, kill_in_contact
 
 from palpate.report.evidence import peak_force
+from palpate.report.recovery import recover_run
 from palpate_benchmarks.campaign import CASES
 from palpate_benchmarks.injection import CONDUCTOR, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
 from palpate_bus.contract import contract
@@ -115,6 +117,12 @@ def test_in_lockstep_the_measured_data_are_recovered(inject: Injector, tmp_path:
     ended = inject_in_conductor(tmp_path, "lockstep", inject)
     *before, last = forces_of(ended)
     assert last[1] <= max(force for _, force in before) + MORE_N
+    (tmp_path / "leaves.py").write_text("import os\n\n\ndef create(scenario):\n    os._exit(0)\n")
+    foreign = tmp_path / "foreign"
+    shutil.copytree(ended.folder, foreign)
+    text = (foreign / "scenario.yaml").read_text(encoding="utf-8")
+    (foreign / "scenario.yaml").write_text(text.replace("assessment: default", f"assessment: {tmp_path / 'leaves.py'}"))
+    assert "services.assessment: left with status 0" in str(recover_run(foreign)[1].failure)
     command = [str(Path(sys.executable).with_name("palpate")), "report", str(ended.folder), "--recover", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr

@@ -107,7 +107,7 @@ def complete_records(path: Path) -> Iterator[object]:
         if not path.stat().st_size:
             return
         data = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
-        at = MAGIC_SIZE
+        at, first_gap = MAGIC_SIZE, True
         while at < len(data) - MAGIC_SIZE:
             try:
                 records, end = _records_at(data, at)
@@ -115,9 +115,11 @@ def complete_records(path: Path) -> Iterator[object]:
                 end = next((m.start() for m in _CHUNK.finditer(data, at + 1) if _is_framed(data, m.start())), len(data))
                 if end == len(data) and data[-MAGIC_SIZE:] != MCAP0_MAGIC:
                     return
-                with suppress(*BROKEN, OSError, RecordingError):  # schemas and channels are repeated there
-                    summary = make_reader(file).get_summary()
-                    yield from () if summary is None else (*summary.schemas.values(), *summary.channels.values())
+                if first_gap:
+                    with suppress(*BROKEN, OSError, RecordingError):  # schemas and channels are repeated there
+                        summary = make_reader(file).get_summary()
+                        yield from () if summary is None else (*summary.schemas.values(), *summary.channels.values())
+                first_gap = False
                 yield Gap(at, end - at)
             else:
                 yield from records

@@ -53,7 +53,7 @@ class Bounds(NamedTuple):
     values: int = 100_000
     """Values of a YAML document, those of its aliases included."""
     elements: int = 2_000_000
-    """Vertices or faces of a mesh, elements of an FMU's array."""
+    """Vertices or faces of a mesh, rows of a table, elements of an FMU's array."""
     depth: int = 50
     """Nesting of YAML and XML."""
 

@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 
 import pytest
 import zstandard
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
+from palpate_bus import mcap_records
 from palpate_bus.contract import contract
-from palpate_bus.mcap_records import RecordingError
+from palpate_bus.mcap_records import Gap, RecordingError, complete_records
 from palpate_bus.messages.typestore import definition, type_hash
 from palpate_bus.recordings import open_recording
 from palpate_errors import UserError
@@ -237,3 +239,14 @@ def test_damage_within_a_finished_file_is_reported_when_it_is_read(tmp_path: Pat
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"damaged; run: python -m palpate_recorder\.recover \S+a\.mcap"):
         list(open_recording(path).messages([TOPIC]))
+
+
+def test_the_summary_of_a_damaged_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "a.mcap", Described(), stamps=tuple(range(4000)), chunk_size=4096, compression=CompressionType.NONE)
+    content, read = bytearray(path.read_bytes()), []
+    for at in (20_000, 60_000, 100_000):
+        content[at] ^= 1
+    path.write_bytes(content)
+    monkeypatch.setattr(mcap_records, "make_reader", lambda file: read.append(file) or make_reader(file))
+    assert sum(isinstance(record, Gap) for record in complete_records(path)) == 3
+    assert len(read) == 1

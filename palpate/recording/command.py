@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,4 +100,5 @@ def scenario_of(recording: PalpationRecording) -> Scenario:
         spacing_m=float(np.clip(spacing, 0.001, 0.05)),
         mode=Mode.CONTINUOUS if sliding else Mode.POINT,
     )
-    return Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
+    name = re.sub(r"^\.|[/\\\x00-\x1f]", "_", recording.name)[:100] or "recording"
+    return Scenario(name=name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))

@@ -77,8 +77,7 @@ def read_table(path: Path) -> pd.DataFrame:
     try:
         file = io.BytesIO(read_bytes(path, ReadingError))
         if path.suffix == ".parquet":
-            _check_parquet(file, path)
-            return pd.read_parquet(file)
+            return pd.read_parquet(file, read_dictionary=_texts(file, path))
         start = file.read(_SNIFFED)
         file.seek(0)
         encoding = "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
@@ -88,7 +87,7 @@ def read_table(path: Path) -> pd.DataFrame:
         separator = max(",;\t|", key=first.count)
         separator = separator if separator in first else r"\s+"
         decimal = "," if separator != "," and re.search(r"\d,\d", text) and not re.search(r"\d\.\d", text) else "."
-        return pd.read_csv(
+        table = pd.read_csv(
             file,
             sep=separator,
             decimal=decimal,
@@ -98,7 +97,10 @@ def read_table(path: Path) -> pd.DataFrame:
             index_col=False if second.endswith(separator) and not first.endswith(separator) else None,
             encoding=encoding,
             encoding_errors="replace",
-        ).rename(columns=str.strip)
+            nrows=bounds().elements + 1,
+        )
+        _check_rows(len(table), path)
+        return table.rename(columns=str.strip)
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
     except UserError:
@@ -107,13 +109,20 @@ def read_table(path: Path) -> pd.DataFrame:
         raise ReadingError(f"{path}: is not a table: {str(error).partition(chr(10))[0]}") from None
 
 
-def _check_parquet(file: io.BytesIO, path: Path) -> None:
-    """Raise ReadingError if a table is large unpacked: equal values take no room in the file."""
-    facts = import_module("pyarrow.parquet").ParquetFile(file).metadata  # of another extra, as pandas imports it
-    if facts.num_rows > bounds().elements:
-        raise over(path, f"{facts.num_rows} rows", "elements", ReadingError)
-    if (size := facts.num_rows * facts.num_columns * 8) > bounds().unpacked_mb * MB:
+def _texts(file: io.BytesIO, path: Path) -> list[str]:
+    """Return the columns of text, whose equal values are kept once. Raises ReadingError if the table is large unpacked."""
+    parquet = import_module("pyarrow.parquet").ParquetFile(file)  # of another extra, as pandas imports it
+    facts = parquet.metadata
+    _check_rows(facts.num_rows, path)
+    stated = sum(facts.row_group(i).total_byte_size for i in range(facts.num_row_groups))
+    if (size := max(stated, facts.num_rows * facts.num_columns * 8)) > bounds().unpacked_mb * MB:
         raise over(path, f"{size / MB:.0f} MB unpacked", "unpacked_mb", ReadingError)
+    return [column.path for column in parquet.schema if column.physical_type == "BYTE_ARRAY"]
+
+
+def _check_rows(count: int, path: Path) -> None:
+    if count > bounds().elements:
+        raise over(path, f"{count} rows", "elements", ReadingError)
 
 
 def numbers_of(column: pd.Series) -> pd.Series:
@@ -161,7 +170,7 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
     return Readings(
         position=values(columns.position, units.length),
         force=values(columns.force, units.force),
-        time=None if times is None else times[:, 0],
+        time=None if times is None else times[:, 0] - times[np.isfinite(times)][0],
         probe=None if columns.probe is None else numbers_or_names(columns.probe),
         rotation=None if quaternion is None else _turn(quaternion, f"{name}: table.orientation"),
         normal=values(columns.normal),

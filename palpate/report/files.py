@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -68,7 +69,7 @@ def bring_back(path: Path) -> None:
     """Restore the results that a killed run with --overwrite had moved away, or name them if their folder has others now."""
     for aside in sorted(path.parent.glob(f".{escape(path.name)}.*")):
         process = aside.suffix[1:]
-        if not process.isdecimal() or psutil.pid_exists(int(process)):
+        if not re.fullmatch(r"\d{1,9}", process) or psutil.pid_exists(int(process)):
             continue
         place = path.with_name(f"{path.name}-before-{process}") if path.exists() else path
         aside.rename(place)

@@ -10,10 +10,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from palpate.apart import run_guarded, shared_numbers
 from palpate.environment import set_environment
 from palpate.replay.golden import rerun
 from palpate.report import archive
@@ -27,9 +28,10 @@ from palpate_bus.messages import NS, ExamState, codec, nanoseconds
 from palpate_bus.messages.geometry import vector
 from palpate_bus.recordings import RecordedMessage
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_bus.settings import variable
+from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult, gave_up
+from palpate_errors import PalpateError
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
@@ -56,11 +58,13 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
     if collected.findings is None or not collected.findings.final:
         try:
             with checkpoint_given(checkpoint):
-                _assess(run)
+                assessed = _assess(run)
+            collected.stiffness_map = assessed.get("assessment/map", collected.stiffness_map)
+            collected.findings = assessed.get("assessment/findings", collected.findings)
         except RecordingError as error:
             raise archive.EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
-        except Exception as error:  # a user-defined assessment, which may have ended the run
-            note = f"; the assessment could not finish: {type(error).__name__}: {error}"
+        except PalpateError as error:  # a user-defined assessment, which may have ended the run
+            note = f"; the assessment could not finish: {error}"
     last = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
     text = f"recovered from an unfinished run: the recording ends at {recording.last / NS:.3f} s"
     text = "; ".join((text, *recording.damage))
@@ -75,23 +79,32 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
     )
 
 
-def _assess(run: archive.InterruptedRun) -> None:
-    """Run the assessment on the recorded examination, as if it had been aborted where the recording ends."""
-    scenario, recording, collected = run.scenario, run.recording, run.collected
-    exam = collected.exam
+def _assess(run: archive.InterruptedRun) -> dict[str, Any]:
+    """Return the last message of each topic of the assessment, run apart on the recorded examination.
+
+    To it the examination was aborted where the recording ends. Raises RecordingError, or PalpateError if it fails.
+    """
+    scenario, recording, exam = run.scenario, run.recording, run.collected.exam
     if exam is None:
-        return
+        return {}
     row = contract().topics["exam/state"]
     end = archive.tick_after(recording.last, "assessment")
     aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
-    over = RecordedMessage(end, row.name, aborted, len(collected.exam_states) + 1)
-    service = create("assessment", scenario.services.assessment, restrict_to_view(scenario, view_of("assessment")))
-    received = chain(archive.inputs(recording, "assessment"), [over])
-    for sent in rerun(service, contract(), received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
-        if sent.topic == "assessment/map":
-            collected.stiffness_map = codec.decode(sent.payload, contract().topics[sent.topic].type)
-        elif sent.topic == "assessment/findings":
-            collected.findings = codec.decode(sent.payload, contract().topics[sent.topic].type)
+    over = RecordedMessage(end, row.name, aborted, len(run.collected.exam_states) + 1)
+    reached = shared_numbers()
+
+    def received() -> Iterator[RecordedMessage]:
+        for reached[0], message in enumerate(chain(archive.inputs(recording, "assessment"), [over])):
+            yield message
+
+    def work() -> dict[str, bytes]:  # all messages at once: earlier maps are not needed
+        service = create("assessment", scenario.services.assessment, restrict_to_view(scenario, view_of("assessment")))
+        return {
+            sent.topic: bytes(sent.payload) for sent in rerun(service, contract(), received(), end + 2 * row.period, begin=end)
+        }
+
+    last = run_guarded("services.assessment", work, Settings.read().start_limit_s, place=lambda: (reached[0],))
+    return {topic: codec.decode(payload, contract().topics[topic].type) for topic, payload in last.items()}
 
 
 class Resumption(NamedTuple):

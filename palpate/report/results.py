@@ -191,7 +191,9 @@ between the measured people, who are similar, 0.2 between places of one person (
 def describe_unassessed(report: Report) -> str:
     """Return sentences on unassessed areas and on an unusual level of stiffness; empty without either."""
     parts = report.unassessed_m2.items()
-    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts) + _level(report)
+    return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS.get(reason, reason)}. " for reason, area in parts) + _level(
+        report
+    )
 
 
 def _level(report: Report) -> str:

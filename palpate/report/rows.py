@@ -2,15 +2,15 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 
 from palpate_bus.messages import Finding
 from palpate_bus.messages.codes import FindingKind
 from palpate_bus.runtime.failure import FailureCode
 
-Point = tuple[float, ...]
+Point = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 
 
 class _Row(BaseModel):
@@ -235,10 +235,19 @@ class Report(_Row):
     """Null if the run ended before there was anything to score, or if the truth is unknown."""
     blame: dict[str, Any]
     """Time budget of each service."""
-    services: dict[str, Any]
+    services: dict[str, dict[str, Any]]
     """Facts that each service reported at its end."""
     recorded: RecordedRow | None = None
     """Null for a run."""
+
+    @field_validator("services")
+    @classmethod
+    def _checked(cls, services: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for role, told in services.items():
+            if not isinstance(told.get("facts", {}), dict):
+                raise ValueError(f"{role}.facts: expected an object")
+        TypeAdapter(dict[int, str]).validate_python(services.get("planning", {}).get("facts", {}).get("skipped_targets", {}))
+        return services
 
     @property
     def abdomen(self) -> bool:

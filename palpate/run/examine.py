@@ -16,7 +16,7 @@ from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import WatchedRoom, check_room, results_folder, unless_begun, usual_folder, what_it_takes
+from palpate.run.folder import WatchedRoom, check_room, results_folder, usual_folder, what_it_takes
 from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
@@ -54,19 +54,17 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
     observers = _observers(scenario, options)
     groups = placement((*workers(scenario), *observers), options.group or (), options.processes)
     folder = options.out or usual_folder(scenario.name)
-    with results_first(), results_folder(folder, overwrite=options.overwrite):
-        display: RunDisplay | None = None
-        with unless_begun(folder, lambda: display is not None and display.begun):
-            if not options.silent:
-                _announce(console, scenario, options, folder)
-            record, checkpoint = {"PALPATE_RECORD": options.record}, None if before is None else before.checkpoint
-            display = RunDisplay(console, options.silent, scenario.exam)
-            with display, set_environment(record), checkpoint_given(checkpoint):
-                check_room(folder, scenario.exam, options.record)
-                tell = WatchedRoom(folder, display.show, say).check
-                result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)
-                if result.unbegun:
-                    raise KeyboardInterrupt
+    display = RunDisplay(console, options.silent, scenario.exam)
+    with results_first(), results_folder(folder, overwrite=options.overwrite, begun=lambda: display.begun):
+        if not options.silent:
+            _announce(console, scenario, options, folder)
+        record, checkpoint = {"PALPATE_RECORD": options.record}, None if before is None else before.checkpoint
+        with display, set_environment(record), checkpoint_given(checkpoint):
+            check_room(folder, scenario.exam, options.record)
+            tell = WatchedRoom(folder, display.show, say).check
+            result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)
+            if result.unbegun:
+                raise KeyboardInterrupt
         if before is not None:
             result = replace(result, run_hash=None, earlier=before.earlier)
         conclude(console, folder, scenario, result, options.silent, options.as_json)

@@ -1,7 +1,6 @@
 """The results folder of a run: refused unless empty, locked during the run, with enough disk space."""
 
 import fcntl
-import json
 import os
 import re
 import shutil
@@ -11,6 +10,8 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+import typer
+
 from palpate.report.files import bring_back
 from palpate.run.inputs import Outlook, duration_text
 from palpate.run.options import Record
@@ -18,6 +19,7 @@ from palpate_bus.runs.run_folder import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunProgress, Tell
 from palpate_errors import UserError
+from palpate_inputs import read_json
 from palpate_models.scenario.schema import Exam
 
 OF_A_RUN = (
@@ -32,17 +34,6 @@ def usual_folder(scenario: str) -> Path:
     return Path("out") / f"{scenario}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
-@contextmanager
-def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
-    """Remove the folder if Ctrl-C or an error ends the block before the examination has `begun`."""
-    try:
-        yield
-    except BaseException:
-        if not begun():
-            shutil.rmtree(path, ignore_errors=True)
-        raise
-
-
 def set_aside(path: Path) -> Path | None:
     """Move the results of an earlier run into a subfolder named by its start and name; return that, or None if there are none.
 
@@ -54,9 +45,14 @@ def set_aside(path: Path) -> Path | None:
     (path / LOCK).unlink(missing_ok=True)
     if not (run := run_of(path)):
         return None
-    began = str(json.loads((path / FILE).read_text(encoding="utf-8")).get("began", ""))
-    earlier = path / "-".join((re.sub(r"\D", "", began.partition("+")[0]), run))
-    earlier.mkdir()
+    began = str(read_json(path / FILE).get("began", ""))
+    earlier = path / "-".join((re.sub(r"\D", "", began)[:14], run))
+    try:
+        earlier.mkdir()
+    except FileExistsError:
+        raise UserError(
+            f"--out {path}: the earlier results are not moved away, {earlier.name} is there; name another folder"
+        ) from None
     for name in OF_A_RUN:
         with suppress(FileNotFoundError):
             (path / name).rename(earlier / name)
@@ -64,11 +60,13 @@ def set_aside(path: Path) -> Path | None:
 
 
 @contextmanager
-def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Make the folder and hold its lock until the run is over.
+def results_folder(path: Path, *, overwrite: bool = False, begun: Callable[[], bool] = lambda: False) -> Iterator[Path]:
+    """Make the folder and hold its lock until the results are written.
 
-    With `overwrite` the results of an earlier run are moved away, removed after this run, and restored if it leaves no folder,
-    as a run that could not begin. Raises UserError if the folder is in use, not empty, or cannot be made.
+    With `overwrite` earlier results are moved away and removed at the end. If an error or Ctrl-C, but not an exit with a status,
+    ends the block before the examination has `begun`, the folder is removed and earlier results are restored.
+
+    Raises UserError if the folder is in use, not empty, or cannot be made.
     """
     bring_back(path)
     earlier = _move_away(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
@@ -81,7 +79,14 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
                 what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
                 raise UserError(f"--out {path}: it holds {what}; name another folder, or --overwrite to remove it first")
-            yield path
+            try:
+                yield path
+            except typer.Exit:  # after results were written
+                raise
+            except BaseException:
+                if not begun():
+                    shutil.rmtree(path, ignore_errors=True)
+                raise
     finally:
         if earlier is not None and path.exists():
             shutil.rmtree(earlier, ignore_errors=True)

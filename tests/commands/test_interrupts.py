@@ -12,7 +12,6 @@ import psutil
 import pytest
 from waiting import wait_until
 
-from palpate.run.folder import unless_begun
 from palpate.run.interrupts import all_is_measured, results_first
 
 
@@ -95,13 +94,6 @@ def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Pa
     assert run.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both
     assert said.splitlines()[-1] == "palpate: interrupted"
     assert not out.exists()
-
-
-@pytest.mark.parametrize("begun", [True, False])
-def test_ctrl_c_in_an_examination_that_has_begun_keeps_the_folder(begun: bool, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), unless_begun(tmp_path, lambda: begun):
-        raise KeyboardInterrupt
-    assert tmp_path.exists() == begun
 
 
 def test_ctrl_c_during_the_start_is_a_line() -> None:

@@ -14,12 +14,13 @@ from matplotlib.image import imread
 
 from palpate.report import archive
 from palpate.report.figures import Drawing, draw_map
-from palpate.report.page import verdict, write_page
+from palpate.report.page import read_report, verdict, write_page
 from palpate.report.results import Known, assemble, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.report.scoring import Truth
 from palpate.run.roles import write_scenario_files
 from palpate_conductor.outcome import RunResult
+from palpate_errors import UserError
 
 
 def write_run(folder: Path, ran: RunResult) -> str:
@@ -140,6 +141,21 @@ def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
     assert [f.quadrant for f in evidence.collected.findings.findings] == [f.quadrant for f in findings().findings]
     assert np.array_equal(evidence.collected.stiffness_map.stiffness, c.stiffness_map.stiffness)
     assert evidence.phases() == [(5, 0.0, pytest.approx(0.99))]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("services", {"planning": []}, "services.planning"),
+        ("services", {"planning": {"facts": None}}, "planning.facts: expected an object"),
+        ("services", {"planning": {"facts": {"skipped_targets": {"x": "force"}}}}, "valid integer"),
+        ("candidates", [{"centroid_m": []}], "candidates.0.centroid_m"),
+    ],
+)
+def test_a_report_of_another_hand_is_refused_by_field(field: str, value: Any, said: str, whole: Report, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(json.dumps({**whole.model_dump(mode="json"), field: value}), encoding="utf-8")
+    with pytest.raises(UserError, match=said):
+        read_report(tmp_path)
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:

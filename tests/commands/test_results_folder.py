@@ -22,7 +22,7 @@ from palpate.report.results import write_results
 from palpate.run import conducting, examine
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import conduct_others
-from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, unless_begun
+from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, set_aside
 from palpate.run.options import RunOptions
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
@@ -65,9 +65,13 @@ def test_overwriting_removes_an_earlier_run_or_restores_it_when_the_new_one_cann
     out = tmp_path / "out"
     (out / "logs").mkdir(parents=True)
     run = name_run(out)
-    with pytest.raises(ValueError, match="no key"), results_folder(out, overwrite=True), unless_begun(out, lambda: False):
-        raise ValueError("no key")
-    assert run_of(out) == run
+    for begun in (bool, lambda: True):
+        assert run_of(out) == run
+        with pytest.raises(KeyboardInterrupt), results_folder(out, overwrite=True, begun=begun):
+            (out / "logs").mkdir()
+            raise KeyboardInterrupt
+    assert [path.name for path in out.iterdir()] == ["logs"]
+    name_run(out)
     with results_folder(out, overwrite=True):
         assert [path.name for path in out.iterdir()] == ["run.lock"]
     assert list(out.iterdir()) == []
@@ -95,8 +99,15 @@ def test_two_runs_cannot_have_one_folder_at_a_time(tmp_path: Path, overwrite: bo
         assert (out / "scenario.yaml").exists()
 
 
+def test_a_run_json_of_another_hand_names_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"run": "x/../../escaped", "began": "2026"}', encoding="utf-8")
+    assert run_of(tmp_path) == ""
+    assert set_aside(tmp_path) is None
+
+
 def test_what_a_killed_overwrite_had_moved_is_restored_or_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, aside = tmp_path / "lump[1]", tmp_path / ".lump[1].999999999"
+    (tmp_path / f".lump[1].{10**20}").mkdir()  # not a process: left as it is
     for other in (False, True):
         aside.mkdir()
         (aside / "report.json").write_text("earlier")

@@ -1,5 +1,6 @@
 """Proposed mappings: tables of many writers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
+from palpate.recording import readings
 from palpate.recording.command import scenario_of
 from palpate.recording.inspect import propose
 from palpate.recording.mapping import read_mapping
 from palpate.recording.read import read_recording
 from palpate.recording.readings import read_table
 from palpate_errors import ExitStatus, UserError
+from palpate_inputs import Bounds
 
 HEADERS = {
     "plain": ("probe", "x", "y", "z", "fx", "fy", "fz"),
@@ -119,6 +122,37 @@ def test_a_separator_at_the_end_of_each_row_moves_no_column(file: Path) -> None:
     probes().to_csv(file, index=False, lineterminator=",\n")
     file.write_text(file.read_text().replace("fz,\n", "fz\n"))
     assert np.array_equal(read_table(file).x, probes().x)
+
+
+@pytest.mark.parametrize("name", ["", ".data", "a/b\x01", "x" * 101], ids=["none", "dot", "control character", "long"])
+def test_any_name_of_a_file_has_a_scenario(name: str, file: Path) -> None:
+    recording = read_recording(file, proposed(file, probes())[1])
+    assert len(scenario_of(replace(recording, name=name)).name) in range(1, 101)
+
+
+def test_times_of_any_origin_begin_at_zero(file: Path) -> None:
+    table = probes().assign(t=3.9e9 + np.arange(360) * 0.01)
+    times = readings.from_table(table, read_mapping(proposed(file, table)[1]), "a").time
+    assert times == pytest.approx(np.arange(360) * 0.01, abs=1e-6)
+
+
+def test_equal_texts_of_a_table_are_kept_once(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    table = probes().assign(note="x" * 1000, probe="P" + probes().probe.astype(str))
+    table.to_parquet(tmp_path / "a.parquet")
+    assert read_table(tmp_path / "a.parquet").memory_usage(deep=True).note < 10_000
+    mapping = read_mapping(proposed(tmp_path / "a.csv", table)[1])
+    assert len(read_recording(tmp_path / "a.parquet", mapping).touches) == 36
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_table_of_more_rows_than_allowed_is_refused(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pyarrow")
+    probes().to_csv(tmp_path / "a.csv", index=False)
+    probes().to_parquet(tmp_path / "a.parquet")
+    monkeypatch.setattr(readings, "bounds", lambda: Bounds(elements=100))
+    with pytest.raises(UserError, match=r"rows; allowed: 100|elements"):
+        read_table(tmp_path / f"a.{suffix}")
 
 
 def test_a_recording_without_a_map_has_a_report_and_status_2(file: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ and unused shared memory, which zenoh locks in the same way.
 import fcntl
 import json
 import os
+import re
 import shutil
 import tempfile
 from contextlib import suppress
@@ -45,9 +46,10 @@ def in_use(folder: Path) -> bool:
 
 
 def run_of(folder: Path) -> str:
-    """Return the name of the run of a results folder; empty if it has none."""
+    """Return the name of the run of a results folder; empty if it has none, or one that `name_run` does not give."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        return str(read_json(folder / FILE)["run"])
+        name = str(read_json(folder / FILE)["run"])
+        return name if re.fullmatch(rf"[0-9a-f]{{{_LENGTH}}}", name) else ""
     return ""
 
 
