@@ -243,8 +243,8 @@ class Report(_Row):
     @field_validator("services")
     @classmethod
     def _checked(cls, services: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        for role, told in services.items():
-            if not isinstance(told.get("facts", {}), dict):
+        for role, entry in services.items():
+            if not isinstance(entry.get("facts", {}), dict):
                 raise ValueError(f"{role}.facts: expected an object")
         TypeAdapter(dict[int, str]).validate_python(services.get("planning", {}).get("facts", {}).get("skipped_targets", {}))
         return services
