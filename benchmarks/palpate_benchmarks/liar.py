@@ -21,6 +21,7 @@ import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from itertools import islice
 from math import floor
@@ -33,6 +34,7 @@ from palpate_bus.implementations import create as create_service
 from palpate_bus.messages import MS, NS, Message, nanoseconds, time_message
 from palpate_bus.messages.fields import numbers
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_errors import UserError
 from palpate_models.scenario.schema import Services
 
 VARIABLE: Final = "PALPATE_LIE"
@@ -79,9 +81,12 @@ class Lie(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "Lie":
-        """Return the lie of a text with the values of the fields."""
-        topic, path, kind, amount, at_s = text.split()
-        return cls(topic, path, kind, float(amount), float(at_s))
+        """Return the lie of a text with the values of the fields. Raises UserError."""
+        with suppress(ValueError):
+            topic, path, kind, amount, at_s = text.split()
+            if topic in contract().topics and kind in KINDS:
+                return cls(topic, path, kind, float(amount), float(at_s))
+        raise UserError(f"{VARIABLE} = {text!r}: expected TOPIC FIELD KIND AMOUNT SECONDS; kinds are {', '.join(KINDS)}")
 
     def __str__(self) -> str:
         return f"{self.topic} {self.field} {self.kind} {self.amount:g} {self.at_s:g}"
@@ -247,6 +252,6 @@ class Liar(Service):
 
 def create(scenario: Any) -> Service:
     """Return the liar of the environment's lie."""
-    lie = Lie.parse(os.environ[VARIABLE])
+    lie = Lie.parse(os.environ.get(VARIABLE, ""))
     service = create_service(lie.role, getattr(Services(), lie.role, "default"), scenario)
     return Liar(service, lie, lambda: logging.getLogger(__name__).warning(INJECTED, lie))

@@ -17,6 +17,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import MS, NS, SurfaceCorrection, header, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import Stepper
+from palpate_errors import UserError
 
 MOMENT = 5 * MS
 
@@ -39,6 +40,14 @@ def test_a_lie_begins_at_its_moment(lie: str, expected: float) -> None:
     forces = [message.wrench.force.x for message in sent(f"ft/wrench wrench.force {lie}")]
     assert forces[:5] == pytest.approx([1e-3 * t for t in range(5)])
     assert forces[10] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "ft/wrench wrench.force gain 0.3", "ft/torque wrench.force gain 0.3 1", "ft/wrench message x 0 1"]
+)
+def test_a_lie_that_cannot_be_read_is_refused(text: str) -> None:
+    with pytest.raises(UserError, match=r"PALPATE_LIE = .*expected TOPIC FIELD KIND AMOUNT SECONDS"):
+        Lie.parse(text)
 
 
 def test_messages_come_late_twice_and_out_of_order() -> None:
