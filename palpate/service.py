@@ -21,9 +21,8 @@ def main(arguments: list[str]) -> None:
     from palpate_bus.run import load_service, run_service  # noqa: PLC0415 - commands that only start services need neither
     from palpate_models.scenario.load import load_scenario  # noqa: PLC0415
 
-    roles = [name for name in contract().roles if name != "conductor"]
-    if not arguments or arguments[0] not in roles:
-        sys.exit(f"usage: python -m {MODULE} ROLE [NAME_OR_FILE]; ROLE is one of {', '.join(roles)}")
+    if not arguments or arguments[0] not in contract().served:
+        sys.exit(f"usage: python -m {MODULE} ROLE [NAME_OR_FILE]; ROLE is one of {', '.join(contract().served)}")
     role, *words = arguments
     run_service(role, lambda: load_service(role, load_scenario, words[:1]))
 

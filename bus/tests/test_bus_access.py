@@ -9,8 +9,8 @@ import pytest
 import zenoh
 from waiting import wait_until
 
-from palpate_bus.contract import contract
-from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, list_watched
+from palpate_bus.contract import CONDUCTOR, contract
+from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, access_control, list_watched
 from palpate_bus.security.keys import HOSTS, KeysError, certificates, init, members, read
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
@@ -161,7 +161,7 @@ def test_every_row_has_its_rules() -> None:
     for topic in RULES.topics.values():
         key = topic_key(topic, 7)
         for role in RULES.roles:
-            receives = role in topic.readers or (role == WATCHER and topic.name in list_watched(RULES))
+            receives = role in topic.readers or (role == CONDUCTOR and topic.name in list_watched(RULES))
             assert may(role, "ingress", "put", key) is (role == topic.producer), (role, topic.name)
             assert may(role, "egress", "put", key) is receives, (role, topic.name)
             assert may(role, "ingress", "declare_subscriber", key) is receives, (role, topic.name)

@@ -22,6 +22,7 @@ from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
 from palpate.live.topic import every_sender
 from palpate_bus import implementations
+from palpate_bus.contract import CONDUCTOR
 from palpate_bus.messages import MS, NS, Message, RunControl, ServiceReport, codec
 from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
@@ -61,12 +62,12 @@ class LiveRig(Rig):
         self._session = session
         self._domain = domain
         self.graph = GraphWatch(session, domain)
-        producers = {"conductor", *(topic.producer for topic, _ in self.contract.inputs(role))}
+        producers = {CONDUCTOR, *(topic.producer for topic, _ in self.contract.inputs(role))}
         transport = Transport(session)
         self._members = {name: Member(session, name, self.contract, domain, transport) for name in sorted(producers)}
         self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.contract.inputs(role)}
-        self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL_TYPE, "event")
-        self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
+        self._control = self._members[CONDUCTOR].internal_publisher("palpate/control", CONTROL_TYPE, "event")
+        self._reports = self._members[CONDUCTOR].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
         self._readers = {topic.name: every_sender(session, topic, domain) for topic in self.contract.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0

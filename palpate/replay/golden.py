@@ -178,7 +178,7 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     ScenarioError.
     """
     role, _, name = choice.partition("=")
-    workers = [row.name for row in contract().roles.values() if not row.observer and row.name != "conductor"]
+    workers = [name for name, row in contract().served.items() if not row.observer]
     if role not in workers:
         raise PluginError(f"--service {choice}: there is no service {role!r}; allowed are {', '.join(workers)}")
     if name:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 
 from palpate.replay.golden import rerun, write_recording
 from palpate.truth.pressed import Pressed, Touched
-from palpate_bus.contract import contract
+from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.mcap_records import BROKEN, RecordingError
 from palpate_bus.messages import NS, codec, nanoseconds
 from palpate_bus.recordings import RecordedMessage, Recording, open_recording
@@ -278,6 +278,6 @@ def _recording(run: Path) -> Recording:
     while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < _STILL_S:
         sleep(0.1)  # the recorder outlives the conductor by some seconds
     try:
-        return salvage(folder, [topic.name for role in ("conductor", "assessment") for topic, _ in contract().inputs(role)])
+        return salvage(folder, [topic.name for role in (CONDUCTOR, "assessment") for topic, _ in contract().inputs(role)])
     except (OSError, ValueError) as error:
         raise NothingRecordedError(f"{folder}: nothing can be recovered: {error}") from error

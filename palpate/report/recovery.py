@@ -21,7 +21,7 @@ from palpate.report import archive
 from palpate.report.evidence import points
 from palpate_assessment.sampling import columns
 from palpate_assessment.service import AssessmentService
-from palpate_bus.contract import contract
+from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.implementations import create
 from palpate_bus.mcap_records import RecordingError
 from palpate_bus.messages import NS, ExamState, codec, nanoseconds
@@ -73,8 +73,8 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
         runtime=RUNTIME,
         collected=collected,
         sim_time_s=recording.last / NS,
-        failure=Failure(code, text + (f"; last: {last}" if last else "") + note, ("conductor",)),
-        lost={"conductor": recording.last},
+        failure=Failure(code, text + (f"; last: {last}" if last else "") + note, (CONDUCTOR,)),
+        lost={CONDUCTOR: recording.last},
         earlier=tuple(one.collected for one in continued),
     )
 

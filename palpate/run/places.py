@@ -54,10 +54,9 @@ class Absent:
     _sentences: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = [name for name in contract().roles if name != "conductor"]
         for role in self.roles:
-            if role not in known:
-                raise UserError(f"--without {role}: allowed are {', '.join(known)}")
+            if role not in contract().served:
+                raise UserError(f"--without {role}: allowed are {', '.join(contract().served)}")
 
     def check(self, roles: Collection[str]) -> None:
         """Raise UserError for a role that this run does not have."""

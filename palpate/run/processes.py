@@ -20,7 +20,7 @@ from palpate.environment import FIXED, set_environment
 from palpate.run.group import Groups, group_command
 from palpate.run.options import Record
 from palpate.service import command as service_command
-from palpate_bus.contract import contract
+from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.security.access import ROUTER, access_control
@@ -213,7 +213,7 @@ class LocalProcesses:
         own = {role for role in scenario_files if view_of(role) == "scenario"}
         self._scenario_files = {role: file if role in own else self._copy(file) for role, file in scenario_files.items()}
         router = secure.endpoint if secure else settings.router
-        processes = {group[0]: group for group in (("conductor",), *groups)}
+        processes = {group[0]: group for group in ((CONDUCTOR,), *groups)}
         quick = [name for name, roles in processes.items() if BARRIER.issuperset(roles)]
         bus = mesh(tuple(processes), self.folder, lowlatency=quick)
         self.bus = {role: replace(bus[name], router=router) for name, roles in processes.items() for role in roles}

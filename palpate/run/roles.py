@@ -17,7 +17,7 @@ from palpate_plugins import PluginError, is_file
 from palpate_search.posterior import POLICY, policy
 from palpate_search.service import try_policy
 
-_ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
+_ROLES = contract().served
 ROLES = tuple(_ROLES)
 """All roles but the conductor."""
 WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))

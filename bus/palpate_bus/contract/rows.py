@@ -221,6 +221,11 @@ class Contract(_Row):
         self.step_order(tuple(self.roles))
         return self
 
+    @property
+    def served(self) -> dict[str, Role]:
+        """All roles but the conductor, by name."""
+        return {name: role for name, role in self.roles.items() if name != CONDUCTOR}
+
     def outputs(self, role: str) -> tuple[Topic, ...]:
         """Return the topics that a role produces, in contract order."""
         return tuple(topic for topic in self.topics.values() if topic.producer == role)

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from palpate_bus.contract import Contract, Visibility, contract
+from palpate_bus.contract import CONDUCTOR, Contract, Visibility, contract
 from palpate_bus.wire.liveliness import ADMIN_SPACE
 from palpate_bus.wire.rmw import hello_key
 
@@ -25,8 +25,6 @@ VIEWER = "viewer"
 """A member that may read every public topic and send nothing: RViz, Foxglove, or `palpate doctor`."""
 OPERATOR = "operator"
 """A viewer that may also stop and release: `palpate stop` asks the conductor, which forwards the request."""
-WATCHER = "conductor"
-"""The role that monitors the contract in a run. It receives every public topic, like a viewer."""
 ROUTER = "router"
 """Certificate of the router; it may send and receive nothing."""
 OPERATOR_REQUESTS = "*/palpate/operator"
@@ -83,10 +81,10 @@ def access_control(contract: Contract, by: str = "cert_common_names") -> dict[st
         tokens = [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]  # of its node, publishers and subscriptions, see `liveliness`
         access.allow(role, "lives", tokens, True, presence)
     shown = public(contract)
-    access.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
+    access.allow(CONDUCTOR, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
         access.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
-    access.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
+    access.allow(CONDUCTOR, "serves", [OPERATOR_REQUESTS], True, data)
     access.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
     for member in (*contract.roles, VIEWER, OPERATOR):
         access.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
@@ -98,7 +96,7 @@ def access_control(contract: Contract, by: str = "cert_common_names") -> dict[st
 
 def list_watched(contract: Contract) -> list[str]:
     """Return the topics that the monitor of a run may receive, in the contract's order."""
-    shown = {*public(contract), *(topic.name for topic, _ in contract.inputs(WATCHER))}
+    shown = {*public(contract), *(topic.name for topic, _ in contract.inputs(CONDUCTOR))}
     return [name for name in contract.topics if name in shown]
 
 

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from palpate_bus.contract import Contract
+from palpate_bus.contract import CONDUCTOR, Contract
 from palpate_bus.messages import NS, DiagnosticStatus, KeyValue
 from palpate_bus.monitor.health import RECENT_S, SeenViolation, topic_statuses
 from palpate_bus.monitor.monitor import LiveMonitor
-from palpate_bus.security.access import WATCHER, list_watched
+from palpate_bus.security.access import list_watched
 from palpate_conductor.watchdog import RoleProgress
 
 
@@ -39,7 +39,7 @@ class ContractWatch:
 
     def __init__(self, session: zenoh.Session, contract: Contract, domain: int, rate: float | None = None) -> None:
         topics = [contract.topics[name] for name in list_watched(contract)]
-        received = [topic for topic in topics if topic.producer != WATCHER or topic.open]  # without its own
+        received = [topic for topic in topics if topic.producer != CONDUCTOR or topic.open]  # without its own
         fast = [topic.name for topic in received if topic.periodic and topic.period_ms < TUNING.fast_ms]
         self._slow = [topic.name for topic in received if topic.name not in fast]
         self._turns = cycle(fast)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from palpate_bus.contract import CONDUCTOR
 from palpate_bus.messages import NS, ExamState
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
@@ -152,7 +153,7 @@ def failure_of(error: BaseException, t: int) -> Failure:
     if isinstance(error, RunFailed):
         return error.failure
     log.error("the conductor failed", exc_info=error)
-    return Failure(FailureCode.INTERNAL, f"the conductor failed: {type(error).__name__}: {error}", ("conductor",))
+    return Failure(FailureCode.INTERNAL, f"the conductor failed: {type(error).__name__}: {error}", (CONDUCTOR,))
 
 
 def gave_up(collected: Collected) -> Failure | None:

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import psutil
 
-from palpate_bus.contract import Contract
+from palpate_bus.contract import CONDUCTOR, Contract
 from palpate_bus.messages import NS, RunControl, codec
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT, longest_silence_s
 from palpate_bus.runtime.member import Member
@@ -204,7 +204,7 @@ class RunWatchdog:
         awaited = {role: self._producers.get(self.progress[role].waiting_for, "") for role in roles if role not in computing}
         waiting = {role: producer for role, producer in awaited.items() if producer in roles}
         if all(self.progress[role].waiting_for == "grant" for role in roles):
-            return "conductor", "all services wait for a grant of the conductor: planning or the recorder is behind"
+            return CONDUCTOR, "all services wait for a grant of the conductor: planning or the recorder is behind"
         if not waiting:
             role = min(roles, key=lambda name: self.progress[name].moved)
             return role, f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; no service waits for it"

@@ -235,9 +235,7 @@ class DepthFusion:
         return float(np.std(mean))
 
     def fuse(self) -> FusedDepth:
-        """Return the fused window. Raises ValueError without frames."""
-        if not self._frames:
-            raise ValueError("no depth frame to fuse: call add first")
+        """Return the fused window of one frame or more."""
         stack = np.sort(np.stack(self._frames), axis=0)  # NaN goes last
         valid = np.isfinite(stack)
         count = valid.sum(axis=0)
