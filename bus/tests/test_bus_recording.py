@@ -139,7 +139,7 @@ def run(kept: Kept, member: Any) -> Any:
 
 
 def test_received_messages_are_recorded_and_reported(kept: Kept) -> None:
-    member = Bus(HELLO, said(RunControl.GRANT), END)
+    member = Bus(HELLO, said(RunControl.HELLO, "camera"), said(RunControl.GRANT), END)
     detail = run(kept, member)
     assert kept.messages == [FIRST]
     states = [report.state for report in member.reports if report.state != ServiceReport.PROGRESS]

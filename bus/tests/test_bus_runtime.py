@@ -4,17 +4,20 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from time import time_ns
+from unittest import mock
 
 import numpy as np
 import pytest
-from toy_services import joint_state
+from toy_services import TOYS, joint_state
 
 from palpate_bus.contract import Edge, contract
-from palpate_bus.messages import codec
+from palpate_bus.messages import MS, RunControl, codec
 from palpate_bus.run import in_background
+from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet
-from palpate_bus.runtime.wallclock import BIN_NS, age_ms
+from palpate_bus.runtime.wallclock import BIN_NS, WallClockNode, age_ms
 
 ROW = contract().topics["joint_states"]
 
@@ -50,6 +53,34 @@ def test_some_errors_have_a_code_of_their_own() -> None:
     forged, full = ForgedSenderError("twice", "joint_states"), OSError(28, "No space left on device")
     assert Failure.of(forged, "control", ()).code is FailureCode.FORGED
     assert Failure.of(full, "control", ()).code is FailureCode.DISK_FULL
+
+
+def test_services_that_fail_at_their_end_do_not_hide_the_first_failure() -> None:
+    services = [toy() for toy in TOYS.values()]
+    failing = mock.Mock(side_effect=ArithmeticError("the cause"))
+    for service in services:
+        if service.role == "control":
+            service.step, service.finish = failing, mock.Mock(side_effect=KeyError("a consequence"))  # type: ignore[method-assign]
+        if service.role == "tissue":
+            service.finish = mock.Mock(side_effect=SystemExit(1))  # type: ignore[method-assign]
+    run = Composed(services)
+    with pytest.raises(ServiceFailed):
+        run.run(lambda: None, MS)
+    assert run.finish().keys() == TOYS.keys() - {"control", "tissue"}
+    assert run.lost == {"control": 0, "tissue": 0}
+    assert run.failure == Failure(FailureCode.ROLE_FAILED, "control lost at 0.000 s: ArithmeticError: the cause", ("control",))
+
+
+def test_a_replacement_starts_once_it_has_named_its_process() -> None:
+    node = WallClockNode.__new__(WallClockNode)
+    node._link, node._seat, node._data, node._now = mock.Mock(), mock.Mock(role="camera"), {}, time_ns
+    node._receive = mock.Mock()  # type: ignore[method-assign]
+    said = [("assessment", RunControl.HELLO), ("", RunControl.GRANT), ("camera", RunControl.HELLO), ("", RunControl.GRANT)]
+    node._link.poll.side_effect = [RunControl(command, 0, False, role, "") for role, command in said]
+    node._await_start()
+    assert node._link.poll.call_count == 4
+    (report,) = node._seat.reports.send.call_args_list
+    assert report.kwargs["detail"]["pid"] == os.getpid()
 
 
 def test_ages_are_those_of_the_messages_to_within_a_bin() -> None:

@@ -1,7 +1,6 @@
 """A run with all services in one child process: a service that exits, crashes or hangs does not take the command with it."""
 
 from collections.abc import Mapping, MutableSequence
-from contextlib import nullcontext, suppress
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
@@ -192,7 +191,6 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
             report()
         return collector.collected.end_tick
 
-    lost: dict[str, int] = {}
     interrupted = False
     try:
         run.start()
@@ -200,8 +198,6 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
     except ServiceFailed as error:
-        failure = error.failure._replace(text=f"{error.role} lost at {error.t / NS:.3f} s: {error.failure}")
-        lost = {error.role: error.t}
         last = error.t
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report still needs what was measured
         interrupted = isinstance(error, KeyboardInterrupt)
@@ -209,13 +205,10 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
     wall = perf_counter() - start
     report(measured=True)
     place.enter(ChildStage.FINISH)
-    facts = run.finish()
-    for recorder in recorders:
-        if isinstance(recorder, Service):
-            place.enter(ChildStage.FINISH, recorder.role)
-            with suppress(Exception) if recorder.role in run.lost else nullcontext():
-                facts[recorder.role] = recorder.finish()
+    facts = run.finish(*recorders)
     place.enter(ChildStage.FINISH)
+    report(measured=True)
+    failure = failure or run.failure
     return RunResult(
         runtime="composed",
         collected=Collected(),
@@ -224,8 +217,8 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
         sim_time_s=last / NS,
         wall_time_s=wall,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
-        counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
+        counters={role: {"facts": fact} for role, fact in facts.items()},
         failure=failure or incomplete(collector.collected) or unsampled(collector.collected, scenario.exam),
-        lost={**run.lost, **lost},
+        lost=run.lost,
         interrupted=interrupted,
     )

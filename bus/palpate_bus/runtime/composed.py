@@ -1,7 +1,6 @@
 """Composed lockstep: all services in one process, as one group without transport (see `group`)."""
 
-from collections.abc import Callable, Mapping, MutableSequence, Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, MutableSequence, Sequence
 from typing import Any
 
 from palpate_bus.contract import CONDUCTOR, Contract, Topic, contract as default_contract
@@ -46,6 +45,7 @@ class Composed:
     ) -> None:
         """`at` is kept up to date: the number of the role that steps, in the order of the contract, and simulated time [ns]."""
         contract = contract or default_contract()
+        self._roles = contract.roles
         self._group = Group(services, contract)
         self.steppers = self._group.steppers
         self._at: MutableSequence[int] = [NO_ROLE, 0] if at is None else at
@@ -58,9 +58,11 @@ class Composed:
         self._started = False
         self.t = 0
         self.lost: dict[str, int] = {}
-        """Tick [ns] at which each failed observer raised."""
+        """Tick [ns] at which each failed service raised."""
         self.trouble: list[str] = []
-        """Messages for the user about them."""
+        """Messages for the user about failed observers."""
+        self.failure: Failure | None = None
+        """The first failure of another service."""
 
     def _send(self, sent: Sequence[Outgoing], t: int) -> None:
         self._group.deliver(sent)
@@ -79,7 +81,7 @@ class Composed:
             try:
                 self._send(stepper.start(), 0)
             except (Exception, SystemExit) as error:
-                raise ServiceFailed(stepper, 0, error) from error
+                raise self._fail(stepper, 0, error) from error
         self._started = True
 
     def tick(self) -> None:
@@ -92,7 +94,7 @@ class Composed:
                 sent = stepper.step(t)
             except (Exception, SystemExit) as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
-                    raise ServiceFailed(stepper, t, error) from error
+                    raise self._fail(stepper, t, error) from error
                 self._leave_out(stepper.role.name, t, Failure.of(error, stepper.role.name, stepper.buffers.values()).text)
                 self._group.leave_out(frozenset(self.lost))
                 continue
@@ -100,6 +102,13 @@ class Composed:
             if sent:
                 self._send(sent, t)
         self.t = t + self._group.period
+
+    def _fail(self, stepper: Stepper, t: int, cause: BaseException) -> ServiceFailed:
+        """Note the failure of a service other than an observer, and return it."""
+        error = ServiceFailed(stepper, t, cause)
+        self.lost[error.role] = t
+        self.failure = self.failure or error.failure._replace(text=f"{error.role} lost at {t / 1e9:.3f} s: {error.failure}")
+        return error
 
     def _leave_out(self, role: str, t: int, reason: str) -> None:
         self.lost[role] = t
@@ -117,13 +126,24 @@ class Composed:
                 last = min(decided, limit)
         return self.t - self._group.period
 
-    def finish(self) -> dict[str, Mapping[str, Any]]:
-        """Finish every service; return the facts of each. Errors of those that failed before are suppressed."""
+    def finish(self, *tapping: Service) -> dict[str, dict[str, Any]]:
+        """Finish every service and those of the taps; return the facts of each.
+
+        An error is a failure of its service, unless that failed before.
+        """
+        services = {role: stepper.service for role, stepper in self.steppers.items()} | {one.role: one for one in tapping}
         facts = {}
-        for role, stepper in self.steppers.items():
-            self._at[0] = self._numbers[stepper]
-            with suppress(Exception) if role in self.lost else nullcontext():
-                facts[role] = stepper.service.finish()
+        for role, service in services.items():
+            self._at[0] = list(self._roles).index(role)
+            try:
+                facts[role] = dict(service.finish())
+            except (Exception, SystemExit) as error:
+                if role in self.lost:
+                    continue
+                if self._roles[role].observer:
+                    self._leave_out(role, self._at[1], f"{type(error).__name__}: {error}")
+                else:
+                    self._fail(self.steppers[role], self._at[1], error)
         return facts
 
     def run_hash(self) -> str:

@@ -192,7 +192,7 @@ class ObserverNode:
                             raise RunAborted(self._link.lost)
                         sleep(LIMITS.idle_s)
                     self._report()
-                elif message.command == RunControl.HELLO:
+                elif message.command == RunControl.HELLO and message.role in ("", self._service.role):
                     self._drain()
                     self._reports.send(ServiceReport.READY, NEVER, detail={"missing": self._hello(), **process_identity()})
                 elif message.command == RunControl.END:

@@ -105,21 +105,24 @@ class WallClockNode(Node):
     def _await_start(self) -> int:
         """Answer hellos until the conductor sends the common start; return it on this process's monotonic clock [ns].
 
-        The conductor repeats the start for services that replace another during the run.
+        The conductor repeats the start for services that replace another during the run. One counts after a hello, which the
+        conductor sends to a free slot: the answer names the process that it then watches.
         """
+        greeted = False
         while True:
             message = self._link.poll(TIMES.handshake_poll_s)
             self._receive(0)  # a faster service may have sent its latched topics already
             if message is None:
                 continue
-            if message.command == RunControl.HELLO:
+            if message.command == RunControl.HELLO and message.role in ("", self._seat.role):
+                greeted = True
                 self._seat.output.hello()
                 silent = (name for name, data in self._data.items() if not data.hello_received)
                 missing = [name for name in silent if self._stepper.buffers[name].edge.blocking]
                 self._seat.reports.send(ServiceReport.READY, NEVER, detail={"missing": missing, **process_identity()})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
-            elif message.command == RunControl.GRANT:
+            elif message.command == RunControl.GRANT and greeted:
                 return _on_monotonic_clock(int(message.tick), self._now)
 
     def _obey(self, message: Any) -> None:
