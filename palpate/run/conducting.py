@@ -14,13 +14,13 @@ from palpate.run.roles import NONE, OBSERVERS, workers
 from palpate_bus.runs.run_folder import LOCK, in_use
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import close_session, open_session
-from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input, load_scenario
 
 NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
+IN_REAL_TIME = "services.tissue = 'none' is in real time: hardware cannot be slowed down"
 
 
 def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
@@ -32,14 +32,17 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     chosen = load_scenario(str(out / "scenario.yaml"))
     if chosen.services.tissue == NONE and not wallclock:
         raise UserError(NEEDS_WALLCLOCK)
+    rate = Settings.read().rate or 1.0
+    if chosen.services.tissue == NONE and rate < 1.0:
+        raise UserError(IN_REAL_TIME)
     if (out / "report.json").is_file() or ((out / LOCK).is_file() and not in_use(out)):
         raise UserError(f"--out {out}: it holds the results of a run; `palpate prepare --out {out}` moves them away")
     session = open_session()
     roles = (*workers(chosen), *observers)
     with results_first(), lock_output(out):
         with RunDisplay(console, quiet, chosen.exam) as display:
-            timing = Timing(wallclock, 1.0 if realtime else None, Settings.read().rate or 1.0)
-            result = conduct(session, roles, display.show, timing=timing, tree=FrameTree(exam_input(chosen)))
+            timing = Timing(wallclock, 1.0 if realtime else None, rate)
+            result = conduct(session, roles, display.show, timing=timing, exam=exam_input(chosen))
         all_is_measured()
         close_session(session)
         conclude(console, out, chosen, result, quiet)

@@ -10,12 +10,12 @@ from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, choice, foreign_roles, read_record, workers, write_scenario_files
 from palpate_bus import implementations
+from palpate_bus.contract import CONDUCTOR
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
-from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.handover import REPLACEABLE
-from palpate_conductor.outcome import Patience, RunResult, Tell, Timing, unsampled
+from palpate_conductor.outcome import Patience, RunResult, Tell, Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -60,7 +60,7 @@ def run_distributed(
         return {role: f"{how} ({files[role]})" if role in files else how for role, how in local.ended().items()}
 
     try:
-        options = local.bus["conductor"]
+        options = local.bus[CONDUCTOR]
         session = open_session(replace(options, drop_wait_us=WALL_CLOCK_DROP_WAIT_US) if timing.wallclock else options)
         for group in groups:
             if mine := [processes[role] for role in group if role not in absent.roles]:
@@ -79,14 +79,12 @@ def run_distributed(
             patience = patience._replace(absent=absent.roles, join=absent.wait_s)
             absent.call(out, places)
         try:
-            tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, tell, ended, timing, patience, begin, tree)
+                result = conduct(session, roles, tell, ended, timing, patience, begin, exam_input(scenario))
                 all_is_measured()
             at_once = not result.wall_time_s  # it has not begun
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
-            result.failure = result.failure or unsampled(result.collected, scenario.exam)
             return result
         finally:
             close_session(session)

@@ -14,7 +14,7 @@ from palpate.report.files import bring_back
 from palpate.report.recovery import Resumption, checkpoint_given, resumption
 from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
-from palpate.run.conducting import NEEDS_WALLCLOCK
+from palpate.run.conducting import IN_REAL_TIME, NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
 from palpate.run.folder import WatchedRoom, check_room, results_folder, usual_folder, what_it_takes
 from palpate.run.group import Groups, placement
@@ -140,7 +140,7 @@ def _rate(scenario: Scenario) -> float:
         if rate < 1.0 or real or emulated:
             say(f"this machine keeps {rate:g} of real time now: {measured.summary}")
     if rate < 1.0 and real:
-        raise UserError("services.tissue = 'none' is in real time: hardware cannot be slowed down")
+        raise UserError(IN_REAL_TIME)
     if rate < 1.0 and emulated and given is None:
         raise UserError(f"the emulated arm is in real time: start it and the run with PALPATE_RATE={rate:g}")
     return rate

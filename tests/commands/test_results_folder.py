@@ -133,6 +133,9 @@ def test_others_are_conducted_at_the_rate_of_their_environment(tmp_path: Path, m
     with mock.patch.object(conducting, "conduct", side_effect=UserError("enough")) as conduct, pytest.raises(UserError):
         conduct_others(tmp_path, (), realtime=False, wallclock=True, quiet=True)
     assert conduct.call_args.kwargs["timing"].wallclock_rate == 0.25
+    write_scenario_files(load_scenario("clean", ["services.tissue=none"]), tmp_path)
+    with pytest.raises(UserError, match="hardware cannot be slowed down"):
+        conduct_others(tmp_path, (), realtime=False, wallclock=True, quiet=True)
 
 
 def test_a_command_on_a_full_disk_is_not_refused() -> None:

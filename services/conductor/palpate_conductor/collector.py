@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.messages import Clock, DiagnosticArray, ExamState, Quaternion, TFMessage, Transform, TransformStamped, codec
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import MS, NS, header, nanoseconds, time_message
@@ -39,6 +39,8 @@ class FrameTree:
 
 
 DIAGNOSTICS_PERIOD_NS = NS
+END_AFTER_NS = NS
+"""An examination that is over ends the run after this time, whether or not planning announces it."""
 _OVER = frozenset({ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 TF_PERIOD_NS = 50 * MS
 
@@ -99,6 +101,8 @@ class Collected:
     targets: Any | None = None
     stiffness_map: Any | None = None
     findings: Any | None = None
+    end_tick: int | None = None
+    """Simulated time [ns] at which the run ends; None until an exam state announces it, or says that the examination is over."""
 
     @property
     def exam(self) -> Any | None:
@@ -109,19 +113,6 @@ class Collected:
     def targets_reached(self) -> int:
         """Number of targets up to the last one that was measured."""
         return max((int(state.target_index) + 1 for state in self.exam_states if state.steady), default=0)
-
-    @property
-    def end_tick(self) -> int | None:
-        """Simulated time [ns] at which the run ends; None until planning announces it, or says that the examination is over."""
-        exam = self.exam
-        if exam is None or (exam.end_tick < 0 and exam.phase not in _OVER):
-            return None
-        return int(exam.end_tick) if self.end_announced else nanoseconds(exam.header.stamp)
-
-    @property
-    def end_announced(self) -> bool:
-        """True if planning has announced the end tick."""
-        return self.exam is not None and self.exam.end_tick >= 0
 
 
 class CollectedNews:
@@ -161,7 +152,7 @@ def collect(collected: Collected, news: Mapping[str, Any]) -> None:
 class Collector(Service):
     """Role conductor."""
 
-    role = "conductor"
+    role = CONDUCTOR
 
     def __init__(self, tree: FrameTree | None = None) -> None:
         """Without `tree` no `tf` is published."""
@@ -180,7 +171,11 @@ class Collector(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Collect new messages; publish the clock, and diagnostics and frames at their periods."""
         c = self.collected
-        self._exam_states.extend(inbox.new("exam/state"))
+        states = inbox.new("exam/state")
+        self._exam_states.extend(states)
+        for state in states:
+            if c.end_tick is None and (state.end_tick >= 0 or state.phase in _OVER):
+                c.end_tick = int(state.end_tick) if state.end_tick >= 0 else nanoseconds(state.header.stamp) + END_AFTER_NS
         seen = inbox.stamp("exam/state")
         c.exam_time = -1 if seen is None else seen
         self._indentation.extend(inbox.new("truth/indentation"))

@@ -23,9 +23,10 @@ from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import GRANTS, Grants
 from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, incomplete
+from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, incomplete, unsampled
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_inputs import InputError, parse_json
+from palpate_models.scenario.schema import ExamInput
 
 log = logging.getLogger(__name__)
 
@@ -253,8 +254,8 @@ class Conductor:
             for role, how in self._slots.remove_expired().items():
                 reason = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
                 self._mark_lost(role, Failure(FailureCode.ROLE_LOST, reason))
-            if self._slots.empty:
-                self._send(RunControl.HELLO)  # a replacement answers with the id of its process
+            for role in self._slots.empty:
+                self._send(RunControl.HELLO, role=role)  # a replacement answers with the id of its process
             self._notify(*self._member.complaints(), *self._member.suspicions())
             self._operator_requests.poll(self._collector.collected.supervisor)
             self._watch.poll()
@@ -290,7 +291,7 @@ class Conductor:
         collected = self._collector.collected
         records = "recorder" in self._observers and "recorder" not in self.result.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
-        self.grants.extend(collected.exam_time, collected.end_tick, recorded, collected.end_announced)
+        self.grants.extend(collected.exam_time, collected.end_tick, recorded)
 
     def _check_progress(self, finished: Set[str]) -> None:
         """Warn about a stall, and end the run if it lasts too long, or a step of a foreign service does."""
@@ -430,15 +431,15 @@ def conduct(
     timing: Timing | None = None,
     patience: Patience | None = None,
     begin: float | None = None,
-    tree: FrameTree | None = None,
+    exam: ExamInput | None = None,
 ) -> RunResult:
     """Conduct services that are started elsewhere to the end of the run, and return its result.
 
     `exited` gives the roles whose process ended, with a text that says how; `begin` [s] is the time of the command by
-    `perf_counter`; `tree` makes `tf`.
+    `perf_counter`. Without `exam` no `tf` is published, and samples are not counted.
     """
     begin = perf_counter() if begin is None else begin
-    collector = Collector(tree=tree)
+    collector = Collector(tree=FrameTree(exam) if exam else None)
     conductor = Conductor(session, contract(), Settings.read().domain, roles, collector, patience, timing)
 
     def report(c: Conductor) -> None:
@@ -451,6 +452,7 @@ def conduct(
         with rare_collections():
             conductor.run(exited, report)
         result.failure = result.failure or incomplete(collector.collected)
+        result.failure = result.failure or (unsampled(collector.collected, exam.exam) if exam else None)
     except RunFailed as error:
         result.failure = error.failure
     result.start_time_s = (conductor.started_at or perf_counter()) - begin

@@ -22,9 +22,8 @@ class GrantTuning(NamedTuple):
 
     window_ns: int = 500 * MS
     """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
-    recorder_window_ns: int = NS
-    step_window_ns: int = NS
-    """Simulated time [ns] beyond the newest exam state to which an operator may step; planning announces the end so early."""
+    ahead_ns: int = NS
+    """Simulated time [ns] beyond exam state and recording that is never passed, by a step of an operator neither."""
     wallclock_lead_ns: int = 200 * MS
     """Time from the start message to the common start [ns]."""
     regrant_s: float = 0.5
@@ -50,7 +49,9 @@ class Grants:
         self._at = self._paced_since = self._exam_at = self._paused_at = 0.0
         self._paced_from = 0
         self._exam = NEVER
-        self._step_limit = GRANTS.step_window_ns
+        self._end = self._limit
+        """Tick [ns] at which the run ends, as far as is known."""
+        self._step_limit = GRANTS.ahead_ns
         """Last tick [ns] to which an operator may step."""
 
     def begin(self) -> None:
@@ -61,48 +62,43 @@ class Grants:
     def grant(self, tick: int, last: bool = False) -> None:
         """Grant time up to and including `tick` [ns]."""
         self.horizon, self.last, self._at = tick, last, monotonic()
+        self.paused = self.paused and not last
         self._send(tick, last)
 
-    def extend(self, exam: int, end: int | None, recorded: int | None, announced: bool = True) -> None:
+    def extend(self, exam: int, end: int | None, recorded: int | None) -> None:
         """Grant as much as possible.
 
-        `exam` [ns] is the time of the newest exam state, -1 before the first, `end` the end tick it announces or, if not
-        `announced`, the time at which the examination was over, `recorded` the tick up to which the recorder has written, None
-        without one.
+        `exam` [ns] is the time of the newest exam state, -1 before the first, `end` the run's end tick if it is known,
+        `recorded` the tick up to which the recorder has written, None without one.
 
         Raises RunFailed if planning announces an end that has passed or, in wall-clock mode, is silent.
         """
-        if end is None and exam + GRANTS.window_ns >= self._limit:
-            end = self._limit
+        self._end = self._limit if end is None else min(end, self._limit)
         if self._wallclock:
-            self._extend_wallclock(exam, end)
+            self._extend_wallclock(exam, end is not None or exam + GRANTS.window_ns >= self._limit)
             return
         if self.last:
             self._repeat()
             return
-        tick = max(exam, 0) + GRANTS.window_ns
-        self._step_limit = max(exam, 0) + GRANTS.step_window_ns
-        if recorded is not None:
-            tick = min(tick, recorded + GRANTS.recorder_window_ns)
-            self._step_limit = min(self._step_limit, recorded + GRANTS.recorder_window_ns)
+        newest = max(exam, 0)
+        self._step_limit = (newest if recorded is None else min(newest, recorded)) + GRANTS.ahead_ns
+        tick = min(newest + GRANTS.window_ns, self._step_limit)
         if self._realtime is not None:
             tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
         tick = self.horizon if self.paused else max(tick - tick % MS, self.horizon)
-        if end is not None and not announced:
-            end = max(end, self.horizon)  # what is granted cannot be taken back
-        if end is not None and end <= tick:
-            if end < self.horizon:
-                text = f"planning announced the end at {end} ns after {self.horizon} ns had been granted"
+        if self._end <= tick:
+            if self._end < self.horizon:
+                text = f"planning announced the end at {self._end} ns after {self.horizon} ns had been granted"
                 raise RunFailed(FailureCode.CONTRACT_BROKEN, text, "planning", topics=("exam/state",))
-            self.grant(end, last=True)
+            self.grant(self._end, last=True)
         elif tick > self.horizon:
             self.grant(tick)
         else:
             self._repeat()
 
-    def _extend_wallclock(self, exam: int, end: int | None) -> None:
-        if end is not None and not self.last:
-            self.grant(end, last=True)
+    def _extend_wallclock(self, exam: int, ends: bool) -> None:
+        if ends and not self.last:
+            self.grant(self._end, last=True)
             return
         self._repeat()
         if exam != self._exam:
@@ -148,9 +144,9 @@ class Grants:
             return "continues"
         elif not 0 < ms <= GRANTS.window_ns // MS:
             raise UserError(f"step of {ms} ms: allowed are 1 to {GRANTS.window_ns // MS} ms")
-        elif self.horizon + ms * MS > self._step_limit:
+        elif (tick := min(self.horizon + ms * MS, self._end)) > self._step_limit:
             raise UserError(f"step of {ms} ms: planning or the recorder has not finished the steps before; repeat the request")
         else:
             self._paused_at = monotonic()
-            self.grant(self.horizon + ms * MS)
-        return f"pauses at {(self.horizon + MS) / NS:.3f} s"
+            self.grant(tick, last=tick == self._end)
+        return f"{'ends' if self.last else 'pauses'} at {(self.horizon + MS) / NS:.3f} s"

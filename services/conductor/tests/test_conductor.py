@@ -26,11 +26,12 @@ from palpate_bus.wire.rmw import Tagger
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 from palpate_conductor import grants
 from palpate_conductor.collector import Collected, Collector, KeptMessages
-from palpate_conductor.conductor import Conductor
+from palpate_conductor.conductor import Conductor, conduct
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of, incomplete, unsampled
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_errors import UserError
+from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Exam
 
 TOPIC = "truth/indentation"
@@ -56,14 +57,21 @@ def test_kept_messages_equal_the_originals() -> None:
     [
         (ExamState.PHASE_SCAN, -1, None),
         (ExamState.PHASE_DONE, 70, 70),
-        (ExamState.PHASE_DONE, -1, 50),
-        (ExamState.PHASE_ABORTED, -1, 50),
+        (ExamState.PHASE_DONE, -1, 50 + NS),
+        (ExamState.PHASE_ABORTED, -1, 50 + NS),
     ],
 )
-def test_an_examination_that_is_over_ends_the_run_even_if_planning_announces_no_end(
-    phase: int, announced: int, end: int | None
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_an_examination_that_is_over_ends_the_run_at_one_tick_even_if_planning_announces_no_end(
+    phase: int, announced: int, end: int | None, at_once: int
 ) -> None:
-    assert Collected([exam_state(50, phase, end_tick=announced)]).end_tick == end
+    collector, inbox = Collector(), mock.Mock()
+    states = [exam_state(t, phase, end_tick=announced) for t in (50, 60, 70)]
+    for k in range(0, len(states), at_once):
+        received = {"exam/state": states[k : k + at_once]}
+        inbox.new.side_effect = lambda topic, received=received: received.get(topic, [])
+        collector.step(0, inbox)
+    assert collector.collected.end_tick == end
 
 
 @pytest.fixture
@@ -89,14 +97,15 @@ def test_a_pause_has_a_bound_and_is_named(session: zenoh.Session) -> None:
     conductor._extend_grant()
 
 
-def test_an_examination_that_is_over_without_an_announced_end_ends_at_the_granted_time(session: zenoh.Session) -> None:
-    collector = Collector()
-    conductor = Conductor(session, contract(), 0, ("control",), collector)
-    conductor.grants.grant(10_500 * MS)
-    collector.collected.exam_states = [exam_state(10_010 * MS, ExamState.PHASE_DONE, end_tick=-1)]
-    collector.collected.exam_time = 10_010 * MS
-    conductor._extend_grant()
-    assert (conductor.grants.horizon, conductor.grants.last) == (10_500 * MS, True)
+def test_a_step_ends_at_the_announced_end() -> None:
+    granted: list[tuple[int, bool]] = []
+    stepped = grants.Grants(lambda tick, last: granted.append((tick, last)), Timing())
+    stepped.begin()
+    stepped.pace("pause", 0)
+    stepped.extend(490 * MS, 1200 * MS, None)
+    assert [stepped.pace("step", 400) for _ in range(2)] == ["pauses at 0.900 s", "ends at 1.201 s"]
+    assert granted[-1] == (1200 * MS, True)
+    assert not stepped.paused
 
 
 def test_steps_do_not_pass_the_end_that_planning_may_announce_nor_what_the_recorder_can_take() -> None:
@@ -128,7 +137,7 @@ def test_a_planning_that_never_ends_the_examination_ends_the_run_at_its_limit_in
     scanning = incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_SCAN)]))
     assert scanning is not None
     assert (scanning.code, scanning.roles) == (FailureCode.UNENDED, ("planning",))
-    assert incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS)])) is None
+    assert incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_DONE)], end_tick=2 * NS)) is None
 
 
 @pytest.mark.parametrize(
@@ -136,13 +145,24 @@ def test_a_planning_that_never_ends_the_examination_ends_the_run_at_its_limit_in
 )
 def test_targets_that_were_not_sampled_are_not_complete(samples: int, spacing_m: float, complete: bool) -> None:
     exam = Exam(spacing_m=spacing_m)
-    done = exam_state(2 * NS, ExamState.PHASE_DONE, end_tick=2 * NS, target_count=9, targets_skipped=1)
+    done = exam_state(2 * NS, ExamState.PHASE_DONE, target_count=9, targets_skipped=1)
     found = unsampled(Collected([done], samples=[None] * samples), exam)
     assert (found is None) == complete
     assert unsampled(Collected([done], samples=[None] * 10), exam) is not None, "ten samples without a map"
     assert unsampled(Collected([done], samples=[None] * 10, stiffness_map=object()), exam) is None
     scanning = exam_state(NS, ExamState.PHASE_SCAN, steady=True)
     assert unsampled(Collected([scanning, done]), exam) is None, "an assessment need not publish samples"
+
+
+def test_a_conductor_of_services_started_by_others_counts_the_samples(
+    session: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collected = Collected([exam_state(2 * NS, ExamState.PHASE_DONE, target_count=9)], end_tick=3 * NS)
+    monkeypatch.setattr(Collector, "__init__", lambda self, tree: setattr(self, "collected", collected))
+    monkeypatch.setattr(Conductor, "run", lambda *_: None)
+    result = conduct(session, (), mock.Mock(), exam=exam_input(load_scenario("clean")))
+    assert result.failure is not None
+    assert result.failure.code is FailureCode.UNSAMPLED
 
 
 def test_a_planning_that_never_sends_a_state_is_awaited_for_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
