@@ -35,6 +35,8 @@ class CompareTuning(NamedTuple):
     """Minimum share of B's map on that of A: of a smaller one, what lacks counts as a complete disagreement."""
     near_m: float = 0.005
     """Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
+    same_depth_m: float = 0.0005
+    """Maps whose depths differ by more are compared with a message."""
     min_places: int = 10
     confidence: float = 0.9
     resamples: int = 2000
@@ -85,9 +87,10 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
         places, force = np.array([sample.position for sample in at_depth]), np.array([sample.force for sample in at_depth])
     if message is None:
         raise UserError(f"{path}: there is no map to compare: {faults[-1] if faults else 'its samples are too few'}")
-    return ComparedPalpation(
-        path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force, faults
-    )
+    depth = float(message.common_depth)
+    if depth_m is not None and abs(depth - depth_m) > TUNING.same_depth_m:
+        faults += (f"{path}: its map is at {1e3 * depth:.3g} mm, the other at {1e3 * depth_m:.3g} mm: level and bias include it",)
+    return ComparedPalpation(path.stem if path.is_file() else path.name, map_of(message), depth, places, force, faults)
 
 
 class MapAgreement(NamedTuple):

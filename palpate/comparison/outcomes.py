@@ -27,8 +27,9 @@ class SimToReal(NamedTuple):
 
     pairs: int
     simulated_only: int
-    pearson: float
-    pearson_90: tuple[float, float]
+    pearson: float | None
+    """Null if all outcomes on hardware, or all simulated ones, are equal."""
+    pearson_90: tuple[float, float] | None
     rank_violation: float
     """Mean maximum rank violation, in the unit of the outcome."""
     bias: float
@@ -64,8 +65,8 @@ def read_outcomes(path: Path) -> tuple[Array, Array, Array]:
 
 def sim_to_real(real: Array, simulated: Array, more: Array, confidence: float = 0.9) -> SimToReal:
     """Return the figures of pairs, shapes (n,), and of outcomes that were simulated only, shape (m,)."""
-    correlation = pearsonr(simulated, real)
-    band = correlation.confidence_interval(confidence)
+    correlation = pearsonr(simulated, real) if np.ptp(real) and np.ptp(simulated) else None
+    band = None if correlation is None else correlation.confidence_interval(confidence)
     swapped = (np.sign(simulated[:, None] - simulated) != np.sign(real[:, None] - real)) & ~np.eye(len(real), dtype=bool)
     violation = np.where(swapped, np.abs(real[:, None] - real), 0.0).max(axis=1).mean()
     weight = _weight(real, simulated, more)
@@ -76,8 +77,8 @@ def sim_to_real(real: Array, simulated: Array, more: Array, confidence: float = 
     return SimToReal(
         pairs=n,
         simulated_only=len(more),
-        pearson=float(correlation.statistic),
-        pearson_90=(float(band.low), float(band.high)),
+        pearson=None if correlation is None else float(correlation.statistic),
+        pearson_90=None if band is None else (float(band.low), float(band.high)),
         rank_violation=float(violation),
         bias=float((simulated - real).mean()),
         mean_90=_around(float(real.mean()), float(real.var(ddof=1) / n), n, confidence),

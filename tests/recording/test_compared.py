@@ -85,6 +85,10 @@ def test_simulation_narrows_the_interval_of_outcomes(tmp_path: Path) -> None:
     assert np.diff(found.prediction_powered_90) < 0.7 * np.diff(found.mean_90)
 
 
+def test_outcomes_that_are_all_equal_have_no_correlation() -> None:
+    assert sim_to_real(np.ones(4), np.ones(4), np.ones(2)).pearson is None
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
