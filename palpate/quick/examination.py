@@ -18,7 +18,7 @@ from palpate.quick.errors import Loop
 from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, Ints, apply, inverse
-from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.load import ScenarioError, exam_input
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import Following, Scenario
 from palpate_planning.contact import THRESHOLDS, ContactMeasurement
@@ -158,7 +158,9 @@ class QuickExamination:
         self._count = 0
 
     def run(self) -> list[PeriodRow]:
-        """Carry out the examination; return measurements and truth of every period."""
+        """Carry out the examination; return measurements and truth of every period. Raises ScenarioError for a search."""
+        if self._exam.searched:
+            raise ScenarioError("exam.pattern = search: expected a scan, such as lines, for tier: quick has no role search")
         return self._drive(self._strokes())
 
     def press(self, xy: Array, depth_m: float) -> list[PeriodRow]:
@@ -212,7 +214,8 @@ class QuickExamination:
     @property
     def shares(self) -> Array:
         """True share of the breathing excursion at each of these points, shape (n,)."""
-        return np.asarray(self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2]))
+        shares = self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2])
+        return np.asarray(np.nan_to_num(shares))  # a point that an error shifts over the border has none
 
     def _lay(
         self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True, depth_m: float | None = None

@@ -145,6 +145,14 @@ def test_a_patient_who_moves_is_refused() -> None:
         run_quick(scenario(1, settings=(*SMALL, "phantom.motion.kind=shift")))
 
 
+def test_a_search_is_refused_and_a_point_shifted_over_the_border_has_no_breath() -> None:
+    at_the_side = scenario(3, settings=("exam.pattern=search", "exam.region_m=[0.1, 0.1]", "exam.centre_m=[0.15, 0.0]"))
+    examination = QuickExamination(at_the_side, Loop(at_the_side, loop_errors(at_the_side)))
+    assert np.isfinite(examination.shares).all()
+    with pytest.raises(ScenarioError, match=r"exam\.pattern = search"):
+        examination.run()
+
+
 @pytest.mark.parametrize("leave", ["raise SystemExit(0)", "__import__('os')._exit(0)"])
 def test_a_tissue_that_ends_its_process_is_named(tmp_path: Path, leave: str) -> None:
     file = tmp_path / "leaves.py"
