@@ -7,6 +7,7 @@ comparisons are paired, nor on worker and order, so that every way to run the st
 import ast
 import hashlib
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -29,6 +30,7 @@ from palpate_plugins import PluginError, is_file
 TUNE_SEEDS: Final = 1000
 """Seeds below this are for tuning only."""
 MOST_SEEDS: Final = 2**31
+YAML: Final = (".yaml", ".yml")
 IRRELEVANT: Final = ("name", "description")
 """Fields of a scenario that do not change a result."""
 
@@ -93,9 +95,11 @@ def command_of(name: str, request: Request, methods: Sequence[str] = (), service
 def patient_seeds(study: str, population: str, split: Split, count: int, salt: str) -> list[int]:
     """Return the distinct seeds of the first patients of a population: 0 to 999 for tuning, others for the other splits.
 
-    The first seeds do not depend on `count`.
+    The first seeds do not depend on `count`. Raises StudyError if there are not as many.
     """
     first, room = (0, TUNE_SEEDS) if split == "tune" else (TUNE_SEEDS, MOST_SEEDS - TUNE_SEEDS)
+    if count > room:
+        raise StudyError(f"{study}: populations.{population}: {count} patients in split {split}, expected at most {room}")
     found: dict[int, None] = {}
     for number in range(count):
         for attempt in count_from(0):
@@ -214,14 +218,14 @@ def _check_usable(where: str, scenario: Scenario) -> Scenario:
 def _files(scenario: Scenario) -> dict[str, str]:
     """Return the SHA-256 of each file that a result depends on, by path."""
     named = [scenario.phantom.mesh, scenario.phantom.grid, scenario.tissue.fmu, scenario.tissue.fmu_map]
-    functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy)
-    named += [word for word in functions if is_file(word)]
+    functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy, scenario.robot.arm)
+    named += [word for word in functions if is_file(word) or word.endswith(YAML)]
     return {path: file_hash(path) for path in named if path is not None}
 
 
 @cache
 def file_hash(path: str) -> str:
-    """Return the SHA-256 of a file, of a Python file with the modules of its folder that it imports.
+    """Return the SHA-256 of a file, of a Python file with the modules of its folder that it imports, of an arm with its URDF.
 
     Raises StudyError if the file cannot be read.
     """
@@ -233,10 +237,12 @@ def file_hash(path: str) -> str:
 
 
 def _sources(path: Path) -> list[Path]:
-    """Return a file and, if it is Python, the modules of its folder that it imports, and that these import."""
+    """Return a file and, if it is Python, the modules of its folder that it imports, and that these import; an arm's URDF."""
     found = [path]
     for file in found:
-        for name in _imported(file.read_text(encoding="utf-8", errors="replace")) if is_file(file.name) else ():
+        text = file.read_text(encoding="utf-8", errors="replace") if file.name.endswith((".py", *YAML)) else ""
+        found += [urdf for name in re.findall(r"^urdf: *(\S+)", text, re.M) if (urdf := path.parent / name).is_file()]
+        for name in _imported(text) if is_file(file.name) else ():
             near = path.parent / name
             module = near.with_suffix(".py")
             found += [new for new in ([module] if module.is_file() else sorted(near.rglob("*.py"))) if new not in found]

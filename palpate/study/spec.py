@@ -32,6 +32,8 @@ other sources than the population's (`palpate.study.shift`), reported apart."""
 Tier = Literal["whole", "quick"]
 """`whole`: the composed run of all services. `quick`: the indenter without an arm (`palpate.quick`)."""
 Runtime = Literal["lockstep", "wallclock"]
+QUICK: Final = ("tissue", "assessment")
+"""Roles of the tier quick."""
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 Range = tuple[float, float]
 """Minimum and maximum, which `Draw` checks."""
@@ -147,8 +149,9 @@ class Study(Section):
         allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
         if wrong := [name for name in self.each_error if name not in allowed]:
             raise ValueError(f"each_error = {wrong[0]!r}: expected one of {', '.join(allowed)}")
-        if self.tier == "quick" and any(method.runtime == "wallclock" or method.periods for method in self.methods.values()):
-            raise ValueError("runtime: wallclock and periods of a method need tier: whole")
+        methods = self.methods.values() if self.tier == "quick" else ()
+        if any(method.runtime == "wallclock" or method.periods or method.services.keys() - QUICK for method in methods):
+            raise ValueError(f"runtime: wallclock, periods, and services of a method but {' and '.join(QUICK)}, need tier: whole")
         return self
 
     def error_levels(self) -> dict[str, Errors | None]:
@@ -210,10 +213,10 @@ def with_services(study: Study, services: Mapping[str, str]) -> Study:
     """Return the study with a further method of these services, which has the name of the first one. Raises StudyError."""
     try:
         own = _absolute(Method(services=dict(services)), Path())
+        name = Path(next(iter(services.values()))).stem.lower()
+        return Study.model_validate({**dict(study), "methods": {**study.methods, name: own}})
     except ValidationError as error:
         raise StudyError(f"{study.name}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
-    name = Path(next(iter(services.values()))).stem.lower()
-    return study.model_copy(update={"methods": {**study.methods, name: own}})
 
 
 def _absolute(method: Method, folder: Path) -> Method:

@@ -38,6 +38,7 @@ def load(folder: Path, text: str) -> Study:
         (PLAIN + "errors: {t: typical}\neach_error: [force.x]\neach_error_at: [poor]", ("force.x", "force.gain")),
         (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations is given twice")),
         (PLAIN + "tier: quick\nmethods: {m: {runtime: wallclock}}", ("mine.yaml", "wallclock", "tier: whole")),
+        (PLAIN + "tier: quick\nmethods: {m: {services: {planning: x.py}}}", ("mine.yaml", "services", "tissue and assessment")),
         ("[1, 2]", ("mine.yaml", "mapping")),
     ],
 )  # fmt: skip
@@ -92,10 +93,13 @@ def test_one_error_at_a_time_changes_that_error_alone() -> None:
 
 
 def test_a_method_may_have_any_service_but_the_conductor() -> None:
-    assert with_services(study(), {"search": "mine.py"}).methods["mine"].services == {"search": str(Path("mine.py").resolve())}
+    found = with_services(study(tier="whole"), {"search": "mine.py"}).methods["mine"]
+    assert found.services == {"search": str(Path("mine.py").resolve())}
     assert {"palpate_search", "palpate_planning"} <= {*PACKAGES}
     with pytest.raises(StudyError, match=r"services\.conductor: expected one of .*search"):
         with_services(study(), {"conductor": "mine.py"})
+    with pytest.raises(StudyError, match="need tier: whole"):
+        with_services(study(tier="quick"), {"search": "mine.py"})
 
 
 def test_files_are_looked_for_beside_the_study(tmp_path: Path) -> None:
@@ -152,6 +156,13 @@ def test_the_hash_of_a_python_file_includes_the_modules_of_its_folder_that_it_im
     assert file_hash.__wrapped__(str(tmp_path / "mine.py")) != found[2]
 
 
+def test_the_hash_of_an_arm_includes_its_urdf(tmp_path: Path) -> None:
+    arm, urdf = tmp_path / "mine.yaml", tmp_path / "mine.urdf"
+    arm.write_text("urdf: mine.urdf\nflange: tool0\n")
+    found = [file_hash.__wrapped__(str(arm)) for text in ("<robot/>", "<robot />") if urdf.write_text(text)]
+    assert found[0] != found[1]
+
+
 def test_line_separators_in_texts_do_not_end_a_case_and_an_unreadable_line_is_a_failed_attempt() -> None:
     case = cases_of(study())[0].model_copy(update={"files": {"no\u2028such\u0085file": "0"}})
     attempts = [_read_attempt(text) for text in examine_batch([case.model_dump_json()] * 2)]
@@ -186,6 +197,8 @@ def test_splits_share_no_patient_and_more_patients_change_none() -> None:
     assert max(tune) < 1000 <= min(test)
     assert patient_seeds("s", "p", "tune", 100, "salt") == tune[:100]
     assert len(set(patient_seeds("s", "p", "tune", 1000, ""))) == 1000
+    with pytest.raises(StudyError, match=r"populations\.p: 1001 patients in split tune, expected at most 1000"):
+        patient_seeds("s", "p", "tune", 1001, "")
     salted = [patient_seeds("s", "p", split, 5, "another") for split in ("tune", "test")]
     assert [salted[0] == tune[:5], salted[1] == test[:5]] == [True, False], "a salt changes the patients of test alone"
 
