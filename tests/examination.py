@@ -19,8 +19,8 @@ from palpate_bus.messages.codec import decode
 SHORT = ("exam.region_m=[0.06, 0.06]", "exam.centre_m=[-0.055, -0.055]", "exam.spacing_m=0.02", "camera.frames=10")
 """A small region about the lesion of clean: about 40 s of simulated time."""
 
-GATE = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.055, -0.055]", "exam.spacing_m=0.02", "camera.frames=10")
-"""A region that holds the whole lesion of clean and tissue around it: about 60 s of simulated time."""
+GATE = ("exam.region_m=[0.06, 0.1]", "exam.centre_m=[-0.055, -0.055]", "exam.spacing_m=0.02", "camera.frames=10")
+"""A region that holds the whole lesion of clean and tissue around it: about 45 s of simulated time."""
 
 
 TINY = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "phantom.edge_m=0.02", "camera.frames=2")

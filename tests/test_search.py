@@ -74,7 +74,7 @@ def test_presses_and_lumps_have_the_error_of_registration() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_arm_presses_where_the_search_asks(tmp_path: Path) -> None:
-    settings = (GATE[0], GATE[1], GATE[3], "exam.pattern=search", "exam.budget.presses=16")
+    settings = ("exam.region_m=[0.1, 0.1]", GATE[1], GATE[3], "exam.pattern=search", "exam.budget.presses=16")
     finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
     assert finished.status == 0, finished.output
     report, scores = finished.report, finished.report["scores"]

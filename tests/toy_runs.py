@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cache
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from unittest import mock
 
 import zenoh
 
@@ -132,12 +131,11 @@ def assert_failed(outcome: RunResult, code: FailureCode, *roles: str) -> None:
 
 
 @cache
-def composed_hash(end: int = toy_services.END) -> str:
-    """Return the run hash of the toy services in one process, up to `end` [ns]."""
+def composed_hash() -> str:
+    """Return the run hash of the toy services in one process."""
     collector = Collector()
     run = Composed([*(toy() for toy in toy_services.TOYS.values()), collector])
-    with mock.patch.object(toy_services, "END", end):
-        assert run.run(lambda: collector.collected.end_tick, 60 * NS) == end
+    assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
     return run.run_hash()
 
 

@@ -25,7 +25,7 @@ from palpate_bus.wire.zenoh_config import BusOptions
 
 EXAM, STATUS, SAMPLE = (blank(f"palpation_msgs/msg/{name}") for name in ("ExamState", "RobotStatus", "PalpationSample"))
 NAMES, ZEROS = [f"lbr_A{i}" for i in range(1, 8)], np.zeros(7)
-END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
+END = int(float(os.environ.get("TOY_END_S", "1.2")) * NS)
 
 
 def pose(x: float = 0.0) -> Any:

@@ -1,7 +1,5 @@
 """Description of the robot: frames, limits, inertias, collision and visual meshes."""
 
-from xml.etree import ElementTree
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -21,20 +19,6 @@ LINKS = link_names(Robot())
 @pytest.fixture(scope="module")
 def model() -> pin.Model:
     return pin.buildModelFromXML(urdf(Robot()))
-
-
-def test_masses_are_the_published_ones() -> None:
-    robot = Robot(tool_mass_kg=0.5)
-    inertias = robot_arm.inertias(robot)
-    assert sum(inertias[f"lbr_link_{i}"].mass for i in range(8)) == pytest.approx(23.9, abs=1e-5)
-    assert inertias["ft_sensor"].mass + inertias["indenter"].mass == pytest.approx(robot.tool_mass_kg)
-    total = sum(float(mass.attrib["value"]) for mass in ElementTree.fromstring(urdf(robot)).iter("mass"))
-    assert total == pytest.approx(23.9 + TOOL.ft_sensor_mass_kg + robot.tool_mass_kg, abs=1e-5)
-
-
-def test_joints_and_links_have_the_names_of_the_ros2_stack(model: pin.Model) -> None:
-    assert tuple(model.names)[1:] == lbr.JOINT_NAMES
-    assert all(model.existFrame(link) for link in LINKS)
 
 
 def test_upright_arm_has_the_published_height(model: pin.Model) -> None:
@@ -104,12 +88,6 @@ def test_every_link_is_where_the_urdf_has_it(q: np.ndarray) -> None:
 def _corners(box: Box) -> np.ndarray:
     signs = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
     return signs * box.size @ box.X_WB[:3, :3].T + box.X_WB[:3, 3]
-
-
-def test_table_top_spans_what_the_scene_says() -> None:
-    (top,) = (box for box in boxes(Robot()) if box.name == "table_top")
-    np.testing.assert_allclose(_corners(top).max(axis=0), [0.835, 1.0, 0.73])
-    np.testing.assert_allclose(_corners(top).min(axis=0)[:2], [0.285, -1.0])
 
 
 def test_base_carries_the_robot_and_clears_the_table() -> None:

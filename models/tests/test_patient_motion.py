@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import apply
-from palpate_models.patient.breathing import MOST_M, STILL, TABLE_S, Breathing, BreathingCurve
+from palpate_models.patient.breathing import MOST_M, TABLE_S, Breathing, BreathingCurve
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.patient.phantom import build_phantom
@@ -38,12 +38,6 @@ def test_rate_and_depth_are_on_average_those_of_the_setting():
     breaths = many(rate_per_min=14, peak_to_peak_m=0.008)
     assert 60 / durations(breaths).mean() == pytest.approx(14, rel=0.03)
     assert breaths[:, 4].mean() == pytest.approx(0.008, rel=0.04)
-
-
-def test_the_rate_of_deep_breathing_can_be_set():
-    deep = Breathing(kind="deep")
-    assert Breathing(kind="deep", rate_per_min=12).rate_per_min == 12
-    assert Breathing.model_validate(deep.model_dump()) == deep
 
 
 def test_breaths_vary_as_much_as_is_set_and_remember_the_one_before():
@@ -112,10 +106,6 @@ def test_coughs_come_in_bursts_and_leave_the_breaths_as_they_are():
     calm = table()
     count = int((~cough).sum())
     np.testing.assert_array_equal(breaths[~cough][:, 1:], calm[:count, 1:])
-
-
-def test_a_still_patient_does_not_breathe():
-    assert (STILL.largest_m, STILL.excursion(1.3)) == (0, 0)
 
 
 def test_no_breath_is_deeper_than_the_tissue_can_follow():

@@ -127,11 +127,6 @@ def test_the_elastic_tier_gives_the_recorded_ratio() -> None:
     assert lumpy / plain == pytest.approx(lump.ratio, rel=0.005)
 
 
-def test_sneddon_is_hertz_where_it_is_shallow() -> None:
-    assert hertz.sneddon_force(1e-4, 0.02) == pytest.approx(float(hertz.hertz_force(1e-4, 0.02)), rel=2e-3)
-    assert 0.93 < hertz.sneddon_force(0.010, 0.02) / float(hertz.hertz_force(0.010, 0.02)) < 0.96
-
-
 def a_section() -> PageSection:
     checks = (Check("good", 1.0, "N", high=2.0, against="theory"), Check("bad", 3.0, high=2.0), Check("nan", float("nan")))
     return PageSection("name", "Title", "Text.", checks, lambda f: f.subplots().plot([1, 2]))

@@ -37,12 +37,8 @@ def test_snake_goes_through_all_phases_in_order(snake: World) -> None:
     status = snake.status
     assert status.end_tick == snake.t - 10_000_000 + 1_000_000_000
     assert (status.targets_skipped, status.target_count, status.target_index) == (0, 12, 11)
-
-
-def test_after_the_last_stroke_no_target_is_left(snake: World) -> None:
-    palpation = snake.exam._course.palpation
-    assert palpation is not None
-    assert not palpation.remaining
+    assert snake.exam._course.palpation is not None
+    assert not snake.exam._course.palpation.remaining
 
 
 def test_depth_is_true_while_samples_count(snake: World) -> None:
@@ -71,7 +67,7 @@ def test_raster_and_points_lift_between_strokes(pattern: str, mode: str, high: f
     assert order.count(Phase.SCAN) == count
 
 
-@pytest.mark.parametrize("offset", [-0.012, 0.0003, 0.015])
+@pytest.mark.parametrize("offset", [-0.012, 0.015])
 def test_touch_corrects_a_camera_that_is_off(offset: float) -> None:
     world, touched = World(known(**SMALL), offset=offset), []
     while world.status.end_tick < 0:

@@ -12,7 +12,7 @@ from palpate_models.patient import phantom as phantoms
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Background, Lesion, Phantom, Stiffness
-from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS, tension_of_ratio
+from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS
 from palpate_models.patient.wall import MEDIAN, MOST_STIFFENING, Guarding, stress
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, STEP_LIMIT, assemble
@@ -286,15 +286,6 @@ def even_press(model, stiffness, top=(0.0, 0.0, 0.0)):
         p = (top[0], top[1], top[2] + RADIUS_M - SPEED_MPS * k * tissue.dt)
         force, _ = tissue.step(0.0, np.array(p), np.array((0.0, 0.0, -SPEED_MPS)), RADIUS_M)
     return force[2]
-
-
-@pytest.mark.parametrize(("stiffness", "ratio"), [(Stiffness(), 2.6), (PERSON, 1.4), (PERSON, 6.5)])
-def test_a_contracted_wall_has_the_ratio_of_the_scenario(stiffness, ratio):
-    flat = flat_phantom(0.06, 0.0025, stiffness.k_w_n_per_m3)
-    each = np.ones(len(flat.vertices))
-    relaxed = replace(flat, stiffening=stiffness.stiffening_per_m * each)
-    guarded = replace(relaxed, tension=tension_of_ratio(ratio, stiffness) * each)
-    assert even_press(guarded, stiffness) / even_press(relaxed, stiffness) == pytest.approx(ratio, rel=0.04)
 
 
 def test_a_guarded_body_has_the_ratio_in_the_middle_and_none_beside():
