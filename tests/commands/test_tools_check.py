@@ -20,6 +20,7 @@ from palpate_bus.messages import MS, NS, Point, Pose, RobotStatus, SupervisorSta
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import load_scenario
+from palpate_robot.driver import Driver
 
 SCENARIO = load_scenario("clean", STILL)
 HARDWARE = {"robot.lbr", "robot.ros2_control", "camera.ros", "camera.replay"}
@@ -156,6 +157,15 @@ def test_a_live_robot_is_commanded_little_beyond_its_limit_and_may_refuse_it() -
     assert rig.report.failed == []
     (beyond,) = (torque for torque in rig.torques if torque > 10)
     assert 1.0 < beyond / robot._arm(rig).torque_nm[0] < 1.05
+
+
+def test_a_live_robot_that_applies_what_is_beyond_its_limit_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ServiceRig, "live", True)
+    monkeypatch.setattr(Driver, "_torque_fault", lambda *_: None)
+    rig = ServiceRig(made("robot"), RigSettings(SCENARIO, slack_ms=20))
+    rig.run(0.1, robot.quiet(rig))
+    robot._provoke(rig, "a torque", robot.TOUCH.beyond * np.eye(7)[0] * robot._arm(rig).torque_nm, RobotStatus.CAUSE_TORQUE_LIMIT)
+    assert [result.name for result in rig.report.failed] == ["a torque makes it hold"]
 
 
 TIMELY = ("rate", "stamps", "within", "sequence")

@@ -65,17 +65,21 @@ def _still(rig: Rig) -> Array:
     return np.zeros(_arm(rig).joints)
 
 
-def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
-    """Return the inputs with a command on every tick: torques [N m], or positions [rad] relative to the present; shape (n,)."""
-    values, none = np.array(push, dtype=float), np.zeros(0)
-    if _positions(rig):
-        values = values + rig.last("joint_states").position
-    torque, position = (none, values) if _positions(rig) else (values, none)
+def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK, first: Any | None = None) -> Feed:
+    """Return the inputs with a command on every tick, `first` before all others if given.
+
+    Torques [N m], or positions [rad] relative to the present; shape (n,).
+    """
+    positions, none = _positions(rig), np.zeros(0)
+    start = rig.last("joint_states").position if positions else 0.0
     valid = duration_message(rig.contract.topics[COMMAND].expiry)
-    ripple_nm = TOUCH.ripple_nm if rig.live else 0.0
+    ripple_nm = TOUCH.ripple_nm if rig.live and not positions else 0.0
+    pushes = chain([] if first is None else [first], repeat(push))
 
     def command(t: int) -> Any:
-        return JointTorqueCommand(header(t), torque + ripple_nm * (t // MS % 2), position, valid, "", "")
+        values = np.array(next(pushes), dtype=float) + start + ripple_nm * (t // MS % 2)
+        torque, position = (none, values) if positions else (values, none)
+        return JointTorqueCommand(header(t), torque, position, valid, "", "")
 
     return {**quiet(rig, level), COMMAND: command}
 
@@ -180,6 +184,7 @@ def release(rig: Rig) -> None:
 
 
 def _activate(rig: Rig) -> None:
+    rig.run(0.1 + rig.slack_s, quiet(rig))  # commands of before expire, and hold, before the release
     release(rig)
     rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig)))
 
@@ -211,37 +216,37 @@ def _expiry(rig: Rig) -> None:
     _expect_mode(rig, "the hold is latched: new commands do not end it", RobotStatus.MODE_SAFE_HOLD)
 
 
-def _once(rig: Rig, push: Any) -> Feed:
-    """Return the inputs with one command `push`, followed by commands to stay."""
-    still = commanding(rig, _still(rig))
-    sources = chain([commanding(rig, push)[COMMAND]], repeat(still[COMMAND]))
+def _provoke(rig: Rig, what: str, push: Any, cause: int, *, refusable: bool = True) -> None:
+    """Expect a hold for a command while commands continue.
 
-    def command(t: int) -> Any:
-        return next(sources)(t)
-
-    return {**still, COMMAND: command}
-
-
-def _provoke(rig: Rig, what: str, push: Any, *causes: int) -> None:
-    """Expect a hold for a command; a live arm is sent it once."""
+    A live arm is sent it once. One that is `refusable` its port may keep from the driver, which then stays active.
+    """
     _activate(rig)
-    received = rig.run(0.1, (_once if rig.live else commanding)(rig, push))["robot/status"]
-    received += rig.run(0.1 + rig.slack_s, quiet(rig))["robot/status"]
-    _expect_hold(rig, f"{what} makes it hold", received, *causes)
+    received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig), first=push) if rig.live else commanding(rig, push))
+    share = max((_effort_share(rig, item.message) for item in received["joint_states"]), default=np.inf)
+    last = rig.last("robot/status")
+    if rig.live and refusable and share <= 1.0 and last is not None and last.mode == RobotStatus.MODE_ACTIVE:
+        rig.expect(f"{what} is not applied", ok=True, expected="efforts within their limits", got=f"{share:.2g} of the limit")
+    else:
+        _expect_hold(rig, f"{what} makes it hold", received["robot/status"], cause)
+
+
+def _effort_share(rig: Rig, state: Any) -> float:
+    """Return the largest effort of joint states over its limit, 0 without efforts."""
+    return float(np.max(np.abs(state.effort) / _arm(rig).torque_nm)) if len(state.effort) else 0.0
 
 
 def _invalid(rig: Rig) -> None:
-    refused = CEASED if rig.live else ()  # the port of a live service refuses these, so that the driver does not see them
     bad = _still(rig)
     bad[3] = np.nan
-    _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND, *refused)
+    _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
     huge = _still(rig)
     if _positions(rig):
         huge[0] = TOUCH.jump_rad if rig.live else 1.0
-        _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND)
+        _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND, refusable=False)
         return
     huge[0] = (TOUCH.beyond if rig.live else 10) * _arm(rig).torque_nm[0]
-    _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT, *refused)
+    _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 
 def _stop(rig: Rig) -> None:
@@ -302,7 +307,7 @@ def _limits(rig: Rig) -> None:
     arm = _arm(rig)
     states = [item.message for item in rig.log["joint_states"] if np.shape(item.message.effort) == (arm.joints,)]
     if not _positions(rig):
-        worst = np.max(np.abs([state.effort for state in states]), axis=0)
-        rig.within("applied torques never leave their limits", worst / arm.torque_nm, 0.0, 1.0, "of the limit")
+        worst = max(_effort_share(rig, state) for state in states)
+        rig.within("applied torques never leave their limits", worst, 0.0, 1.0, "of the limit")
     speeds = np.max(np.abs([state.velocity for state in states]), axis=0)
     rig.below("joint speeds never leave their limits", np.max(speeds / arm.velocity_radps), 1.05, "of the limit")
