@@ -197,7 +197,7 @@ class Collector(Service):
             self._diagnostics_at = t
             out["diagnostics"] = DiagnosticArray(header(t), list(self.diagnose()))
         status = inbox.latest("robot/status")
-        if self._tree is not None and status is not None and t - self._tf_at >= TF_PERIOD_NS:
+        if self._tree is not None and status is not None and len(status.position) and t - self._tf_at >= TF_PERIOD_NS:
             self._tf_at = t
             out["tf"] = self._tree.message(nanoseconds(status.header.stamp), status.position)
         return out

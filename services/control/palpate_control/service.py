@@ -120,8 +120,8 @@ class ControlService(Service):
             old = Problem("joint_states", f"joint_states: measured {age:.0f} ms ago, limit {limit:.0f} ms")
             expired = Problem(TOPIC, f"the last {TOPIC} expired {(t - self._setpoint_expires) / MS:.0f} ms ago")
             return self._stop_commands(t, self._stop_reason or (old if frozen else self._refused or expired))
-        stale = self._stale(t, received, inbox)
-        if stale is not None and not (self._positions and t < self._last_expires):
+        stale = self._stale(t, received, joints, inbox)
+        if stale is not None and not (self._positions and joints.name and t < self._last_expires):
             return self._repeat(t, stale)
         q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
         if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
@@ -203,11 +203,13 @@ class ControlService(Service):
             self._last = np.array(joints.position)
         return self._command(t, self._last, self._full_validity, problem)
 
-    def _stale(self, t: int, joints_received: int, inbox: Inbox) -> Problem | None:
+    def _stale(self, t: int, joints_received: int, joints: Message, inbox: Inbox) -> Problem | None:
         """Pass F/T readings to a law that takes them; return a problem if they or the joint states are stale."""
         if t - joints_received > self._joint_states_age:
             late, limit = (t - joints_received) / MS, self._joint_states_age / MS
             return Problem("joint_states", f"joint_states: {late:.0f} ms old, limit {limit:.0f} ms")
+        if not joints.name:
+            return Problem("joint_states", "joint_states: the arm reports none")
         if self._admittance is None:
             return None
         for message in inbox.new("robot/status"):

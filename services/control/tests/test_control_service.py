@@ -174,6 +174,16 @@ def test_while_joint_states_are_stale_positions_follow_the_setpoints_no_longer_t
     assert EXPIRY < rig.t - since < EXPIRY + 25 * MS
 
 
+@pytest.mark.parametrize("level", [CommandLevel.TORQUE, CommandLevel.POSITION])
+def test_joint_states_of_no_joints_are_stale(level: CommandLevel) -> None:
+    rig, none = Rig(level), np.zeros(0)
+    rig.send(setpoint(0))
+    rig.tick(10)
+    rest = [rig.tick(message=JointState(header(rig.t), [], none, none, none)) for _ in range(60)]
+    assert [valid_for(command) for command in rest] == [max(EXPIRY - (k + 1) * MS, 0) for k in range(60)]
+    assert rest[-1].problem == "joint_states: the arm reports none"
+
+
 def moving(t: int) -> np.ndarray:
     """Joint 1 at 0.8 rad/s from HOME, the others at rest."""
     return np.array(HOME) + 0.8 * 1e-9 * t * np.eye(7)[0]

@@ -71,7 +71,7 @@ class PerceptionService(Service):
             depth = geometry.depth_in_metres("camera/follow/depth", image)
         except ValueError:  # unknown encoding: ignore the image
             depth, camera = np.empty((0, 0), np.float32), None
-        q = None if status is None else np.asarray(status.position, np.float64)
+        q = None if status is None or not len(status.position) else np.asarray(status.position, np.float64)
         wall = self._follower.take(stamp / NS, depth, camera, q)
         state, shift = getattr(SurfaceMotion, wall.state.name), geometry.vector_message(wall.shift)
         return SurfaceMotion(header(stamp, MOTION_FRAME), state, wall.displacement, wall.forecast, wall.sigma, shift)

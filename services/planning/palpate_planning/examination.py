@@ -181,7 +181,7 @@ class ExaminationSequence:
         self._began = now.t if self._began is None else self._began
         if now.reading is None:
             q = self._kinematics.arm.home_rad
-            self._await_robot(now.t, self._began)
+            self._await_robot(now, self._began)
             return ExamStep(None, setpoint=joint_setpoint(now.t, self._kinematics.pose(q), q, np.zeros_like(q), np.zeros_like(q)))
         if not self._started:
             self._started = True
@@ -206,14 +206,15 @@ class ExaminationSequence:
 
     # --- waits --------------------------------------------------------------------------------------------------------
 
-    def _await_robot(self, t: int, began: int) -> None:
-        """Report that the robot is awaited since `began` [ns], and abort after a time."""
-        status, waited_s = self.status, (t - began) / SECOND
+    def _await_robot(self, now: Observation, began: int) -> None:
+        """Report that the robot is awaited since `began` [ns], with its reason if it has one, and abort after a time."""
+        status, waited_s, reason = self.status, (now.t - began) / SECOND, now.stop.cause.text
         if status.phase in OVER or waited_s < WAIT.reported_s:
             return
-        status.cause, status.message = FOR_ROBOT.cause, FOR_ROBOT.cause.text
+        status.cause, status.message = FOR_ROBOT.cause, reason or FOR_ROBOT.cause.text
         if waited_s > WAIT.limit_s:
-            self._course.enter(Phase.ABORTED, t, f"aborted before the robot was ready: {FOR_ROBOT.end.text}", FOR_ROBOT.end)
+            text = f"aborted before the robot was ready: {reason or FOR_ROBOT.end.text}"
+            self._course.enter(Phase.ABORTED, now.t, text, FOR_ROBOT.end)
 
     def _await_plan(self, t: int) -> None:
         """Report that the motion planner is awaited: in wall-clock mode it may take long."""

@@ -72,7 +72,7 @@ class PlanningService(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Advance one planning period: read the measurements, step the examination, write set-point and state."""
         status = inbox.latest("robot/status")
-        if status is not None:
+        if status is not None and len(status.position):
             stamp, force = nanoseconds(status.header.stamp), wrench(status.wrench)
             self._reading = SensorReading(stamp, status.position.copy(), force, status.velocity.copy())
             self._commanded = self._commanded or status.mode == RobotStatus.MODE_ACTIVE

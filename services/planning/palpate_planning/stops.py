@@ -135,6 +135,9 @@ class Stops:
     def _resume(self, now: Observation) -> None:
         """Return to the interrupted phase; a free motion is planned again."""
         course, palpation = self._course, self._palpation
+        if not (self._soft or self._resuming):  # it may have been moved by hand since the latest measurement in the stop
+            assert now.reading is not None
+            course.arm.hold(now.reading.q)
         self._resuming = True
         goal = self._free_goal(palpation)
         if goal is not None:

@@ -62,6 +62,14 @@ def test_after_a_release_it_resumes_without_losses(phase: Phase, soft: bool) -> 
     assert max(row[5] for row in world.rows) < 5.0, "after the stop the force is not larger"
 
 
+def test_an_arm_that_was_moved_at_the_end_of_a_stop_is_held_where_it_is() -> None:
+    world = stopped_in(Phase.HOME, soft=False)
+    world.stop, world.q = NO_CAUSE, world.q + 0.3 * np.eye(7)[0]
+    there = world.q
+    world.steps(5)
+    np.testing.assert_allclose(world.exam._course.arm.q, there, atol=1e-9)
+
+
 def test_an_arm_that_was_pushed_while_the_strokes_were_planned_starts_where_it_is() -> None:
     world = stopped_in(Phase.PLAN, soft=False)
     for _ in range(100):

@@ -1,6 +1,7 @@
 """Tests of the service with messages encoded and decoded as on the bus."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,20 @@ def test_the_arm_is_held_where_it_was_found() -> None:
     setpoint = sent(create(Scenario(robot=BASE)).step(0, inbox))["planning/setpoint"]
     np.testing.assert_allclose(setpoint.joint_position, HOME + 0.2, atol=1e-12)
     assert np.all(setpoint.joint_stiffness > 0)
+
+
+def test_a_status_without_positions_is_no_measurement() -> None:
+    service, inbox, none = create(Scenario(robot=BASE)), HandInbox(), np.zeros(0)
+    missing = status(0, none, np.zeros(6), RobotStatus.MODE_IDLE, "no joint states received yet")
+    inbox.put("robot/status", replace(missing, velocity=none))
+    for t in (0, 6000 * MS):
+        out = sent(service.step(t, inbox))
+    assert not np.any(out["planning/setpoint"].joint_stiffness)
+    assert (out["exam/state"].reason, out["exam/state"].phase) == (Reason.WAITS_FOR_ROBOT, Phase.HOME)
+    assert out["exam/state"].message == "the robot is not ready: no joint states received yet"
+    inbox.put("robot/status", status(6010 * MS, HOME + 0.2, np.zeros(6)))
+    out = sent(service.step(6010 * MS, inbox))
+    np.testing.assert_allclose(out["planning/setpoint"].joint_position, HOME + 0.2, atol=1e-12)
 
 
 def idle(reason: str, mode: int = RobotStatus.MODE_IDLE) -> Any:

@@ -1,5 +1,6 @@
 """The driver of ros2_control on the emulator of each profile, in simulated time."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,20 +9,21 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck
-from palpate_bus.messages import JointState, JointTorqueCommand, RobotStatus, WrenchStamped, duration_message, header
+from palpate_bus.messages import JointState, JointTorqueCommand, RobotStatus, WrenchStamped, blank, duration_message, header
 from palpate_bus.messages.codes import DriverMode, HoldCause
-from palpate_bus.messages.geometry import wrench_message
+from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
-from palpate_models.robot.arm import arm_of
+from palpate_models.robot.arm import arm_of, tool_pose
 from palpate_models.robot.chain import Arm
 from palpate_models.robot.urdf_arm import load_arm
 from palpate_models.scenario.arm_file import arm_path
 from palpate_models.scenario.load import exam_input, load_scenario
-from palpate_robot.backends.ros2_control.port import Ros2Port, StackStatus
+from palpate_robot.backends.ros2_control.port import POSE, FlangePose, Ros2Port, StackStatus
 from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules
 from palpate_robot.backends.ros2_control.service import FirstContactCheck, Ros2ControlService, create
+from palpate_robot.backends.ros2_control.watchdog import command_of
 
 MS = 1_000_000
 WALL_NPM = 2000.0
@@ -148,12 +150,13 @@ class HandPort(Ros2Port):
 
     def __init__(self, arm: Arm) -> None:
         self.names, self.q, self.running, self.t = list(arm.joint_names), arm.home_rad.copy(), True, 0
+        self.silent = False
         self.sent: list[Any] = []
         self.poses: list[Any] = []
 
     def states(self) -> list[Any]:
         self.t += MS
-        return [JointState(header(self.t), self.names, self.q, 0.01 + 0 * self.q, 0 * self.q)]
+        return [] if self.silent else [JointState(header(self.t), self.names, self.q, 0.01 + 0 * self.q, 0 * self.q)]
 
     def wrenches(self) -> list[Any]:
         return [WrenchStamped(header(self.t), wrench_message(np.zeros(6)))]
@@ -174,11 +177,16 @@ def by_hand(arm: str, profile: str, *changes: str) -> tuple[Ros2ControlService, 
     return Ros2ControlService(exam, port, profile_of(exam.robot)), port
 
 
-def test_a_hold_of_an_arm_that_takes_positions_does_not_go_back() -> None:
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_hold_of_an_arm_that_takes_positions_does_not_go_back(silent: bool) -> None:
     bench = Ros2Bench("ur5", "ur")
     bench.speed_radps = 0.5
     bench.tick(400)
-    bench.driver._driver.hold(bench.t, HoldCause.STOP_REQUESTED, "stop")
+    if silent:  # control ends
+        last = bench.inbox.messages["control/joint_torque"]
+        bench._command = lambda: last  # type: ignore[method-assign]
+    else:
+        bench.driver._driver.hold(bench.t, HoldCause.STOP_REQUESTED, "stop")
     sent, q = [bench.emulator.command[0]], []
     for _ in range(250):
         bench.tick(1)
@@ -187,6 +195,7 @@ def test_a_hold_of_an_arm_that_takes_positions_does_not_go_back() -> None:
     assert np.diff(sent).min() > -1e-9
     assert np.diff(sent)[-1] == pytest.approx(0.0, abs=1e-9)
     assert max(q) - q[-1] < 1e-3
+    assert bench.driver._driver.held
 
 
 def test_the_emulated_position_loop_takes_each_command_once() -> None:
@@ -242,6 +251,64 @@ def test_a_cartesian_controller_is_sent_poses_only_and_those_of_its_own_flange(t
         assert not port.sent, "its topic takes no torques"
         poses.append(port.poses[-1])
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-6)
+
+
+def test_a_status_without_states_has_no_positions() -> None:
+    driver, port = by_hand("panda", "franka")
+    positions = []
+    for t in range(0, 400 * MS, MS):
+        port.silent = not 100 * MS <= t < 200 * MS
+        if status := driver.step(t, HandInbox()).get("robot/status"):
+            positions.append(len(status.position))
+    assert positions == [0] * 10 + [7] * 11 + [0] * 19
+
+
+def test_a_cartesian_controller_is_left_without_a_pull() -> None:
+    driver, port = by_hand("panda", "franka", "robot.level=setpoint")
+    inbox, t, robot = HandInbox(), 0, driver._robot
+    X_WI, rest = tool_pose(port.q, robot), FlangePose(robot).at(port.q)
+
+    def tick(ticks: int, planned: bool = True) -> DriverMode:
+        nonlocal t
+        for _ in range(ticks):
+            t += MS
+            torque = JointTorqueCommand(header(t), np.full(7, 5.0), np.zeros(0), duration_message(50 * MS), "", "")
+            inbox.messages["control/joint_torque"] = torque
+            if planned:
+                pose, valid = pose_message(X_WI[:3, :3], X_WI[:3, 3] - (0.0, 0.0, 0.02)), duration_message(250 * MS)
+                setpoint = replace(blank("palpation_msgs/msg/ImpedanceSetpoint", t, "world"), pose=pose, valid_for=valid)
+                inbox.messages["planning/setpoint"] = setpoint
+            driver.step(t, inbox)
+        return driver._driver.mode
+
+    assert tick(30) is DriverMode.ACTIVE
+    assert port.poses[-1][2, 3] == pytest.approx(rest[2, 3] - 0.02)
+    assert tick(240, planned=False) is DriverMode.ACTIVE
+    assert tick(20, planned=False) is DriverMode.SAFE_HOLD
+    assert (driver._driver.cause, driver._driver.culprit) == (HoldCause.COMMAND_EXPIRED, "planning/setpoint")
+    driver._driver.release(t)
+    assert tick(30) is DriverMode.ACTIVE
+    port.silent, sent = True, len(port.poses)
+    tick(100)
+    np.testing.assert_allclose(port.poses[-1], rest)
+    assert len(port.poses) == sent + 1
+    assert driver.finish()["peak_torque_nm"] == [0.0] * 7
+    kind, command = command_of(robot)
+    assert (kind, command(port.q, np.zeros(7)).pose.position.z) == (POSE, pytest.approx(rest[2, 3]))
+
+
+LATE = {
+    "level of the arm": ("ur5", "franka", [], "robot.level: position"),
+    "level": ("panda", "franka", ["robot.level=setpoint"], "robot.level: setpoint"),
+    "event": ("panda", "franka", ['robot.driver.events=["1 speed 0.5"]'], "robot.driver.events: 'speed 0.5'"),
+    "time": ("ur5", "ur", ['robot.driver.events=["soon speed 0.5"]'], "robot.driver.events: 'soon"),
+}
+
+
+@pytest.mark.parametrize(("arm", "profile", "changes", "named"), LATE.values(), ids=LATE)
+def test_what_the_emulator_cannot_do_is_refused_at_the_start(arm: str, profile: str, changes: list[str], named: str) -> None:
+    with pytest.raises(UserError, match=named):
+        Ros2Bench(arm, profile, *changes)
 
 
 def still(joints: int, force_n: float = 0.0, speed_radps: float = 0.0) -> Sensed:

@@ -146,6 +146,13 @@ class SupervisorService(Service):
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
+        held = []
+        if status.mode == RobotStatus.MODE_SAFE_HOLD:
+            reason = f"safe hold of the driver: {status.reason}"
+            held.append(Breach(StopLevel.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
+        if not len(status.position):  # the arm reports none
+            self._agreement = MotionAgreement()
+            return held
         # Arrays of messages are read-only, a different type for numba.
         measured = Measurement(
             np.array(status.position), np.array(status.velocity), wrench(status.wrench), np.array(status.measured_torque)
@@ -173,10 +180,7 @@ class SupervisorService(Service):
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
             reason = f"robot/status repeats a measurement of age {age}"
             found.append(Breach(StopLevel.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
-        if status.mode == RobotStatus.MODE_SAFE_HOLD:
-            reason = f"safe hold of the driver: {status.reason}"
-            found.append(Breach(StopLevel.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
-        return found
+        return found + held
 
 
 def create(scenario: Scenario) -> SupervisorService:

@@ -329,6 +329,21 @@ def test_every_status_counts_after_a_late_step() -> None:
     assert late.step(70 * MS, inbox)["supervisor/state"].joint_force == state.joint_force
 
 
+def test_an_arm_that_stops_while_it_reports_no_positions_is_no_broken_sensor() -> None:
+    service, none, turning = SupervisorService(KNOWN), np.zeros(0), np.eye(7)[0]
+    causes = []
+    for n in range(60):
+        measured, t = status(n * 10 * MS, 0.0), n * 10 * MS
+        speed, turned = (0.5, 0.005 * n) if n < 10 else (0.0, 0.06)
+        measured = replace(measured, position=measured.position + turned * turning, velocity=speed * turning)
+        if 10 <= n < 40:
+            measured = replace(measured, mode=2, position=none, velocity=none, measured_torque=none, reason="no joint states")
+        messages = {"robot/status": measured} | (request(OperatorRequest.RELEASE) if n == 45 else {})
+        causes.append(after(service, t, messages).cause)
+    assert causes[:10] + causes[45:] == [SupervisorState.CAUSE_NONE] * 25
+    assert causes[10:45] == [SupervisorState.CAUSE_DRIVER] * 35
+
+
 def test_a_measurement_that_is_only_repeated_is_silence() -> None:
     service = create(load_scenario("healthy"))
     for t in range(0, service_module.TUNING.settle_ns, 10 * MS):

@@ -194,11 +194,15 @@ class HardwareService(Service):
         self._applied = np.zeros(n)
         self._limits, self._braking = (arm.lower_rad, arm.upper_rad), LOOP.acceleration_factor * arm.acceleration_radps2
         self._sent, self._sent_v, self._sent_at = np.zeros(n), np.zeros(n), NEVER_NS
-        """Newest command of positions [rad], its speed [rad/s] and its time [ns]."""
+        """Newest positions sent [rad], their speed [rad/s] and their time [ns]."""
+        self._taken, self._taken_at = self._sent, NEVER_NS
+        """Newest command of positions [rad] and the time at which it was sent first [ns]."""
+        self._pushing = False
+        """True while the newest command may push."""
         self._fault: str | None = None
         """Fault of the arm or the F/T sensor; no command is accepted with one."""
         self._sums, self._summed = np.zeros(6 + 2 * n + len(measured.torque)), 0
-        self._means = self._sums
+        self._mean_wrench = np.zeros(6)
         self._states = self._commands = 0
         self._peak_force = 0.0
         self._peak_torque = np.zeros(n)
@@ -224,8 +228,8 @@ class HardwareService(Service):
             elif t - self._arm.received > STATE_AGE_NS:
                 none = np.zeros(0)  # lockstep needs a message on every tick
                 joints = JointState(header(t), [], none, none, none)
-                # Damping of an old speed would be a constant push. Zero torque is sent once; then the watchdog takes over.
-                if self._applied.any():
+                # Damping of an old speed would be a constant push. The arm is relaxed once; then the watchdog takes over.
+                if self._pushing:
                     self._relax()
             outbox[JOINTS] = joints  # on every tick: between two states the newest, with its stamp
         if not t % STATUS_PERIOD:
@@ -237,7 +241,7 @@ class HardwareService(Service):
     def finish(self) -> Mapping[str, Any]:
         """Leave the arm without torque. Return safe holds, counts, and the largest force and torques."""
         try:
-            if self._arm.received is not None and not self._positions:
+            if self._arm.received is not None:
                 self._relax()
         finally:
             self._port.close()
@@ -251,8 +255,10 @@ class HardwareService(Service):
         }
 
     def _relax(self) -> None:
-        self._applied = np.zeros_like(self._applied)
-        self._port.command(self._arm.q, self._applied)
+        """Send no torque; an arm that takes positions stays."""
+        self._pushing = False
+        if not self._positions:
+            self._put(np.zeros_like(self._applied), active=False)
 
     def _receive(self, t: int) -> bool:
         """Take messages of the ROS side; return True if the joint state is new."""
@@ -306,36 +312,48 @@ class HardwareService(Service):
             if not active and not self._driver.held:
                 return
             values = self._moved(t, values if active else None)
-        else:
-            if not active:
-                values = -np.minimum(self._driver.damping(arm.v, load.gravity), self._damping) * arm.v
-            self._applied = np.asarray(values, dtype=float)
-            np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
-        self._send(t, values, load, active=active)
+        elif not active:
+            values = -np.minimum(self._driver.damping(arm.v, load.gravity), self._damping) * arm.v
+        if active and (fault := self._check_response(t, values, load)):
+            self._driver.hold(t, HoldCause.DEVICE, fault)
+            self._sent_at = NEVER_NS  # the arm is not where it was sent
+            return  # the next state is answered by the hold
+        self._put(values, active=active)
+        self._commanding_since = t if self._commanding_since is None else self._commanding_since
+        self._pushing = True
+        self._commands += 1
 
     def _moved(self, t: int, values: Array | None) -> Array:
         """Return the positions to send at `t` [ns]: `values`, or where the arm stops from the last ones, and stays [rad].
 
-        An arm that takes no commands, or had no recent one, may have been moved by hand: it stays where it is.
+        Values that come again are late ones: the motion continues for a short time. An arm that takes no commands, or had no
+        recent one, may have been moved by hand: it stays where it is.
         """
         arm, elapsed_s = self._arm, (t - self._sent_at) / NS
-        if values is not None:
+        if values is not None and values is not self._taken:
+            self._taken, self._taken_at = values, t
             speed = (values - self._sent) / elapsed_s
             self._sent_v = np.clip(speed, np.minimum(arm.v, 0.0), np.maximum(arm.v, 0.0))  # a leap of one is not a speed
         elif not arm.accepts or t - self._sent_at > STATE_AGE_NS:
             values, self._sent_v = arm.q, np.zeros_like(arm.q)
         else:
-            slower = elapsed_s * self._braking
+            late = values is None or t - self._taken_at > LOOP.extrapolation_ns
+            slower = elapsed_s * self._braking * late
             self._sent_v = self._sent_v - np.clip(self._sent_v, -slower, slower)
             values = np.clip(self._sent + elapsed_s * self._sent_v, *self._limits)
         self._sent, self._sent_at = values, t
         return values
 
-    def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
-        """Send torques [N m] or positions [rad] at `t` [ns]; `active` if they are control's."""
+    def _check_response(self, t: int, values: Array, load: CarriedLoad) -> str:
+        """Return a message if the arm does not respond to commands as it should, else an empty text."""
+        return ""
+
+    def _put(self, values: Array, *, active: bool) -> None:
+        """Send torques [N m] or positions [rad]; `active` if they are control's."""
         self._port.command(self._arm.q, values)
-        self._commanding_since = t if self._commanding_since is None else self._commanding_since
-        self._commands += 1
+        if not self._positions:
+            self._applied = values
+            np.maximum(self._peak_torque, np.abs(values), out=self._peak_torque)
 
     def _command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
         message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
@@ -343,15 +361,15 @@ class HardwareService(Service):
 
     def _status(self, t: int) -> Message:
         driver, n = self._driver, len(self._names)
+        q = v = torque = np.zeros(0)
         if self._summed:
-            self._means = self._sums / self._summed
+            q, v, self._mean_wrench, torque = np.split(self._sums / self._summed, (n, 2 * n, 2 * n + 6))
             self._sums, self._summed = np.zeros_like(self._sums), 0
-        q, v, wrench, torque = np.split(self._means, (n, 2 * n, 2 * n + 6))
         cause, reason = driver.cause, driver.reason
         if not driver.held and self._fault is not None:
             cause, reason = HoldCause.DEVICE, self._fault
         return RobotStatus(
-            header(t), int(driver.mode), int(cause), reason, q, v, wrench_message(wrench),
+            header(t), int(driver.mode), int(cause), reason, q, v, wrench_message(self._mean_wrench),
             self._applied.copy(), driver.rejected, driver.culprit, torque,
         )  # fmt: skip
 

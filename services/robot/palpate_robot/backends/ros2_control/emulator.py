@@ -29,7 +29,7 @@ from palpate_robot.backends.emulated import EmulatedArm, serve
 from palpate_robot.backends.hardware import GravityModel, tool_load
 from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, Ros2Port, StackStatus
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
-from palpate_robot.backends.ros2_control.rules import RULES, Sensed
+from palpate_robot.backends.ros2_control.rules import RULES, Rules, Sensed
 from palpate_robot.position_loop import PositionLoop
 
 log = logging.getLogger("emulator")
@@ -44,6 +44,8 @@ class Ros2Emulator(EmulatedArm):
             raise UserError("robot.driver.profile: the emulator needs a profile with a stack")
         arm = arm_of(known.robot)
         self.rules = RULES[profile.stack](arm)
+        if known.robot.level is not self.rules.commands:
+            raise UserError(f"robot.level: {known.robot.level}: the emulator of {profile.stack} takes {self.rules.commands}")
         super().__init__(known, self.rules.period_ms)
         given = known.robot.driver.model_copy(update={"ft_sign": None, "ft_weight": None})
         self.profile = profile_of(known.robot.model_copy(update={"driver": given}))
@@ -53,7 +55,7 @@ class Ros2Emulator(EmulatedArm):
         self._order = [arm.joint_names.index(name) for name in self._names]
         self._model = GravityModel(known.robot)
         self._loop = PositionLoop(arm, self._joints.q) if self.rules.commands is CommandLevel.POSITION else None
-        self._events = sorted(map(_split_time, known.robot.driver.events))
+        self._events = sorted(_split_time(text, self.rules) for text in known.robot.driver.events)
         self._begun: int | None = None
 
     def cycle(self, now: int) -> None:
@@ -139,12 +141,13 @@ class EmulatedPort(Ros2Port):
         """See `ArmPort.close`: there is nothing to disconnect."""
 
 
-def _split_time(text: str) -> tuple[float, str]:
+def _split_time(text: str, rules: Rules) -> tuple[float, str]:
     time, _, event = text.partition(" ")
+    rules.setting(event)
     try:
         return float(time), event
     except ValueError:
-        raise UserError(f"event {text!r}: expected a time [s], a name and a number, such as '12.5 speed 0.5'") from None
+        raise UserError(f"robot.driver.events: {text!r}: expected a time [s] first, such as '12.5 speed 0.5'") from None
 
 
 def serve_graph(emulator: Ros2Emulator, node: RosNode, level: CommandLevel) -> None:
@@ -193,11 +196,11 @@ def main(arguments: list[str] | None = None) -> int:
         profile = profile_of(known.robot)
         emulator = Ros2Emulator(known, profile)
         node = RosNode("palpate_emulator", known.robot.driver.domain, BusOptions(listen=(given.listen,)))
+        log.info("%s with the rules of %s at %s, every %d ms", known.robot.arm, profile.stack, given.listen, emulator.period_ms)
+        serve_graph(emulator, node, known.robot.level)
     except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2
-    log.info("%s with the rules of %s at %s, every %d ms", known.robot.arm, profile.stack, given.listen, emulator.period_ms)
-    serve_graph(emulator, node, known.robot.level)
     return 0
 
 

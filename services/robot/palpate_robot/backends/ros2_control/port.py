@@ -2,11 +2,13 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from palpate_bus.messages import codec, header
 from palpate_bus.messages.geometry import pose_message
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import arm_of
+from palpate_models.numerics.frames import Array, rigid
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.arm_port import ArmPort, ZenohArmPort
@@ -48,6 +50,31 @@ def array_message(values: Array) -> Any:
     return codec.message_type(ARRAY)(layout(dim=[], data_offset=0), values)
 
 
+class FlangePose:
+    """Poses of the URDF's flange in the arm's base, as a Cartesian controller takes them, shape (4, 4)."""
+
+    def __init__(self, robot: Robot) -> None:
+        arm, turned = arm_of(robot), base_pose(robot)
+        if arm.R_BL is not None:
+            turned[:3, :3] = turned[:3, :3] @ arm.R_BL.T
+        R_FU = np.eye(3) if arm.R_FU is None else arm.R_FU
+        self._robot, self._X_BW = robot, np.linalg.inv(turned)
+        self._X_IU = rigid(R_FU, (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
+
+    def of(self, X_WI: Array) -> Array:
+        """Return the pose for that of the indenter in world."""
+        return np.asarray(self._X_BW @ X_WI @ self._X_IU)
+
+    def at(self, q: Array) -> Array:
+        """Return the pose at joint positions `q` [rad], shape (n,)."""
+        return self.of(tool_pose(q, self._robot))
+
+
+def pose_command(X_BU: Array, base: str) -> Any:
+    """Return a geometry_msgs/PoseStamped in the frame `base`."""
+    return codec.message_type(POSE)(header(0, base), pose_message(X_BU[:3, :3], X_BU[:3, 3]))
+
+
 class ZenohRos2Port(ZenohArmPort, Ros2Port):
     """Connection over zenoh, with the keys of rmw_zenoh."""
 
@@ -67,8 +94,7 @@ class ZenohRos2Port(ZenohArmPort, Ros2Port):
 
     def pose(self, X_BU: Array) -> None:
         """See `Ros2Port.pose`."""
-        pose = pose_message(X_BU[:3, :3], X_BU[:3, 3])
-        self._command.publish(codec.message_type(POSE)(header(0, self._base), pose))
+        self._command.publish(pose_command(X_BU, self._base))
 
     def status(self) -> StackStatus:
         """See `Ros2Port.status`."""

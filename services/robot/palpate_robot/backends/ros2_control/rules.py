@@ -66,8 +66,8 @@ class Rules(ABC):
         """True while commands have an effect."""
         return not self.stopped and bool(self.settings["controller"])
 
-    def event(self, text: str) -> None:
-        """Apply an event, such as `speed 0.5`. Raises UserError for an unknown one."""
+    def setting(self, text: str) -> tuple[str, float]:
+        """Return name and number of an event, such as `speed 0.5`. Raises UserError for an unknown one."""
         name, _, value = text.partition(" ")
         try:
             number = float(value)
@@ -75,7 +75,13 @@ class Rules(ABC):
             number = np.nan
         low, high = self.ranges.get(name, (0.0, np.inf))
         if not low <= number <= high or name not in (*self.settings, "recover"):
-            raise UserError(f"event {text!r}: expected one of {', '.join((*self.settings, 'recover'))}, then {low:g} to {high:g}")
+            names = ", ".join((*self.settings, "recover"))
+            raise UserError(f"robot.driver.events: {text!r}: expected one of {names}, then {low:g} to {high:g}")
+        return name, number
+
+    def event(self, text: str) -> None:
+        """Apply an event. Raises UserError for an unknown one."""
+        name, number = self.setting(text)
         if name == "recover":
             self._recover()
         else:

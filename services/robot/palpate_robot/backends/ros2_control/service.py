@@ -10,19 +10,20 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from palpate_bus.messages import NS
-from palpate_bus.messages.codes import HoldCause
+from palpate_bus.contract import contract
+from palpate_bus.messages import NS, nanoseconds
+from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import BusConfigError, Settings
-from palpate_models.numerics.frames import Array, rigid
-from palpate_models.robot.arm import TOOL, arm_of, base_pose, tool_pose
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.arm import arm_of, tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_robot.backends.hardware import NEVER_NS, SETPOINT, CarriedLoad, HardwareService
+from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port
+from palpate_robot.backends.ros2_control.port import FlangePose, Ros2Port, ZenohRos2Port
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 
 
@@ -47,6 +48,7 @@ class CheckTuning(NamedTuple):
 
 
 TUNING: Final = CheckTuning()
+SETPOINT_EXPIRY_NS: Final = contract().topics[SETPOINT].expiry
 DAMPING_SHARE: Final = 0.1
 """Maximum joint damping in a hold over that of the simulated driver (assumed): it acts one to three cycles late."""
 _TOLERANCE: Final = {
@@ -125,44 +127,42 @@ class Ros2ControlService(HardwareService):
         super().__init__(exam, port, measured, damping, ft_sign=profile.ft_sign, ft_weight=profile.ft_weight)
         self._profile, self._level = profile, exam.robot.level
         self._followed, self._first = FollowCheck(_TOLERANCE[self._level]), FirstContactCheck()
+        self._flange = FlangePose(exam.robot)
         self._setpoint: Any | None = None
-        turned = base_pose(exam.robot)
-        if arm.R_BL is not None:
-            turned[:3, :3] = turned[:3, :3] @ arm.R_BL.T
-        self._X_BW = np.linalg.inv(turned)
-        R_FU = np.eye(3) if arm.R_FU is None else arm.R_FU
-        self._X_IU = rigid(R_FU, (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Run one tick, with the status of the stack."""
         self._arm.report(self._port.status())
-        self._setpoint = inbox.latest(SETPOINT) if self._level is CommandLevel.SETPOINT else None
+        if self._level is CommandLevel.SETPOINT:
+            self._setpoint = self._valid(t, inbox.latest(SETPOINT))
         return super().step(t, inbox)
 
     def finish(self) -> Mapping[str, Any]:
         """Return what the base returns, and if the first contact was checked."""
         return {**super().finish(), "first_contact_checked": self._first.passed}
 
-    def _relax(self) -> None:
-        """Send zero torque; the springs of a Cartesian controller are relaxed already: its target follows the tool in a hold."""
-        if self._level is not CommandLevel.SETPOINT:
-            super()._relax()
+    def _valid(self, t: int, setpoint: Any | None) -> Any | None:
+        """Return the set-point if it is valid at `t` [ns]; an active driver holds on an expired one."""
+        if setpoint is None:
+            return None
+        late = t - nanoseconds(setpoint.header.stamp) - min(nanoseconds(setpoint.valid_for), SETPOINT_EXPIRY_NS)
+        if late <= 0:
+            return setpoint
+        if self._driver.mode is DriverMode.ACTIVE:
+            reason = f"the last {SETPOINT} expired {late / 1e6:.0f} ms ago"
+            self._driver.hold(t, HoldCause.COMMAND_EXPIRED, reason, SETPOINT)
+        return None
 
-    def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
+    def _put(self, values: Array, *, active: bool) -> None:
+        """Send `values`. A Cartesian controller is sent the set-point, or the pose of the tool, which does not pull."""
         if not active:
             self._followed.reset()
-        elif fault := self._check_response(t, values, load):
-            self._driver.hold(t, HoldCause.DEVICE, fault)
-            self._sent_at = NEVER_NS  # the arm is not where it was sent
-            return  # the next state is answered by the hold
-        if self._level is CommandLevel.SETPOINT:
-            X_WI = tool_pose(self._arm.q, self._robot)
-            if active and self._setpoint is not None:
-                X_WI = pose_matrix(self._setpoint.pose)
-            self._port.pose(self._X_BW @ X_WI @ self._X_IU)
-            self._commands += 1
+        if self._level is not CommandLevel.SETPOINT:
+            super()._put(values, active=active)
+        elif active and self._setpoint is not None:
+            self._port.pose(self._flange.of(pose_matrix(self._setpoint.pose)))
         else:
-            super()._send(t, values, load, active=active)
+            self._port.pose(self._flange.at(self._arm.q))
 
     def _check_response(self, t: int, values: Array, load: CarriedLoad) -> str:
         """Return a message if the arm does not follow or the first contact has the wrong sign, else an empty text."""

@@ -1,19 +1,23 @@
-"""The watchdog of an arm that takes torques behind ros2_control: forward_command_controller applies the last ones for ever.
+"""The watchdog of an arm behind ros2_control that takes torques or set-points: its controller follows the last ones for ever.
 
 python -m palpate_robot.backends.ros2_control.watchdog my_arm.yaml     # on the robot's computer, before the driver
 """
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import Any
 
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import ARRAY, STATE, array_message
+from palpate_robot.backends.ros2_control.port import ARRAY, POSE, STATE, FlangePose, array_message, pose_command
 from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.watchdog import Watchdog, watch
 
@@ -29,17 +33,26 @@ def main() -> int:
     given = parser.parse_args()
     try:
         robot = exam_input(load_scenario(given.scenario, given.set)).robot
-        if robot.level is not CommandLevel.TORQUE:
-            raise UserError(f"robot.level: {robot.level}: only an arm that takes torques has a watchdog; others stay")
+        if robot.level is CommandLevel.POSITION:
+            raise UserError(f"robot.level: {robot.level}: expected torque or setpoint; an arm that takes positions stays")
         profile, arm = profile_of(robot), arm_of(robot)
         node = RosNode("palpate_watchdog", robot.driver.domain, BusOptions(router=robot.driver.router))
     except UserError as error:
         print(f"watchdog: {error}", file=sys.stderr)
         return 2
     measured = MeasuredJoints(arm, effort_is_torque=profile.effort_is_torque)
-    state, command = (profile.topic(profile.joint_states), STATE), (profile.commands(robot.level), ARRAY)
-    watch(Watchdog(measured, DAMPING_SHARE * arm.hold_damping_nms), node, state, command, lambda q, torque: array_message(torque))
+    kind, message = command_of(robot)
+    state, command = (profile.topic(profile.joint_states), STATE), (profile.commands(robot.level), kind)
+    watch(Watchdog(measured, DAMPING_SHARE * arm.hold_damping_nms), node, state, command, message)
     return 0
+
+
+def command_of(robot: Robot) -> tuple[str, Callable[[Array, Array], Any]]:
+    """Return type and maker of commands, from positions and torque, shapes (n,): the torque, or the pose, which does not pull."""
+    if robot.level is CommandLevel.TORQUE:
+        return ARRAY, lambda q, torque: array_message(torque)
+    flange, base = FlangePose(robot), next(iter(arm_of(robot).link_names))
+    return POSE, lambda q, torque: pose_command(flange.at(q), base)
 
 
 if __name__ == "__main__":
