@@ -141,7 +141,9 @@ class ExaminationSequence:
         """State of the examination."""
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart, self._return_to_arm = RestartRamp(), ReturnToArm(step_s, rates)
-        self._approach_waits, self._tally = StrokeWaits(step_s, Tally()), Tally()
+        self._tally = Tally()
+        self._approach_waits: StrokeWaits
+        """Of the present plan."""
         self._views = Views(look_postures(known))
         self._remainder = Remainder()
         self._requested = RequestedPresses(lockstep=lockstep)
@@ -340,6 +342,7 @@ class ExaminationSequence:
             self._sense.wall.shift_A = self._sense.wall.breath.shift_A
             out.path, course.palpation = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m), None
             course.arm.start(plan.approach)
+            self._approach_waits = StrokeWaits(self._step_s, Tally())
             self.status.targets_skipped = len(self.skipped)
             course.enter(Phase.APPROACH, now.t, count_causes(plan.skipped.values()) or "approaching the first target")
         elif self._planning.late(now.t):

@@ -68,8 +68,9 @@ RATE_SHARE = 0.8
 class ReturnToArm:
     """Spreads a leap of the set-point to the arm over several periods, within the contract's rates.
 
-    A motion that ends early continues from the arm, which lags behind, was held, or does not follow at all. Any other leap is not
-    changed: the port refuses it.
+    A motion that ends early continues from the arm, which lags behind, was held, or does not follow at all. A field that leaps
+    towards the arm is limited until it is where it is wanted, though the arm may move. Any other leap is not changed: the port
+    refuses it.
     """
 
     def __init__(self, period_s: float, rates: Mapping[str, float]) -> None:
@@ -77,6 +78,8 @@ class ReturnToArm:
         fields = ("pose.position", "pose.orientation", "joint_position")
         self._step_m, self._step_rad, self._joint_step_rad = (RATE_SHARE * rates[field] * period_s for field in fields)
         self._last: Setpoint | None = None
+        self._returning = False, False, False
+        """True for each of position, orientation and joint positions that has leapt and has not arrived."""
 
     def step(self, wanted: Setpoint, X_WI: Array, q: Array) -> Setpoint:
         """Return the set-point of a period; X_WI, shape (4, 4), and q [rad], shape (n,): measured pose and posture."""
@@ -86,13 +89,23 @@ class ReturnToArm:
 
     def _limited(self, last: Setpoint, wanted: Setpoint, X_WI: Array, q: Array) -> Setpoint:
         p_arm, change, turn = X_WI[:3, 3], wanted.p_WD - last.p_WD, wanted.q - last.q
-        length = sqrt(change.dot(change))
-        if length > self._step_m and np.linalg.norm(wanted.p_WD - p_arm) < np.linalg.norm(last.p_WD - p_arm):
+        length, returning = sqrt(change.dot(change)), self._returning
+        position = length > self._step_m and (
+            returning[0] or np.linalg.norm(wanted.p_WD - p_arm) < np.linalg.norm(last.p_WD - p_arm)
+        )
+        orientation = _cosine(last.R_WD, wanted.R_WD) < cos(self._step_rad) and (
+            returning[1] or _cosine(wanted.R_WD, X_WI) > _cosine(last.R_WD, X_WI)
+        )
+        joints = np.abs(turn).max() > self._joint_step_rad and (
+            returning[2] or np.abs(wanted.q - q).max() < np.abs(last.q - q).max()
+        )
+        self._returning = position, orientation, joints
+        if position:
             wanted = wanted._replace(p_WD=last.p_WD + change * (self._step_m / length))
-        if _cosine(last.R_WD, wanted.R_WD) < cos(self._step_rad) and _cosine(wanted.R_WD, X_WI) > _cosine(last.R_WD, X_WI):
+        if orientation:
             phi = pin.log3(last.R_WD.T @ wanted.R_WD)
             wanted = wanted._replace(R_WD=last.R_WD @ pin.exp3(phi * (self._step_rad / np.linalg.norm(phi))))
-        if np.abs(turn).max() > self._joint_step_rad and np.abs(wanted.q - q).max() < np.abs(last.q - q).max():
+        if joints:
             wanted = wanted._replace(q=last.q + np.clip(turn, -self._joint_step_rad, self._joint_step_rad))
         return wanted
 

@@ -92,7 +92,7 @@ class Tally:
 
 
 class StrokeWaits:
-    """Counts the time in which the arm waits since the strokes last made progress."""
+    """Counts the time in which the arm waits: of one approach, or of all strokes since they last made progress."""
 
     def __init__(self, period_s: float, tally: Tally) -> None:
         self._period_s, self._waited_s = period_s, tally.waited_s

@@ -28,7 +28,7 @@ from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.requests import PressRequest
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits, Tally
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits, Tally
 from palpate_planning.wall.breath import Breath, BreathObservation
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
@@ -319,6 +319,18 @@ def test_only_a_leap_to_the_arm_is_spread() -> None:
         assert pytest.approx(pose(target)[:3, :3]) == sent[-1].R_WD
 
 
+def test_a_return_is_spread_to_its_end_though_the_arm_comes_to_meet_the_setpoint() -> None:
+    arm, still, ramp, sent = np.array(lbr.HOME), np.zeros(7), ReturnToArm(PERIOD_S, RATES), []
+    pose = World(known(**SMALL)).kinematics.pose
+    X_WI = pose(arm).copy()
+    for k, wanted in enumerate([arm + 0.1, *[arm] * 29]):
+        sent.append(ramp.step(joint_setpoint(k * 10 * MS, pose(wanted), wanted, still, still), X_WI, arm))
+        if k:
+            X_WI[:3, :3], X_WI[:3, 3] = sent[-1].R_WD, sent[-1].p_WD
+    check_at_port(sent)
+    assert (sent[-1].p_WD == pose(arm)[:3, 3]).all()
+
+
 def test_the_arm_lifts_before_a_sudden_force_and_presses_there_again() -> None:
     world = World(known(**SMALL))
     world.reach(StrokeStage.SLIDE, 2)
@@ -437,6 +449,15 @@ def test_a_silent_perception_is_named_at_once() -> None:
     world.watch(lambda _: setattr(world, "_answer_at", None))
     assert Reason.WAITS_FOR_PERCEPTION in world.reasons
     assert world.status.cause.reason is Reason.VIEW_TIMEOUT
+
+
+def test_each_approach_has_its_own_time_to_wait() -> None:
+    world = World(known(**SMALL))
+    for _ in range(3):
+        world.run_to(Phase.APPROACH)
+        world.exam._approach_waits.step(FOR_JOINTS)
+        assert world.exam._approach_waits._waited_s[FOR_JOINTS] == PERIOD_S
+        world.exam._course.enter(Phase.PLAN, world.t, "planning again")
 
 
 def test_an_arm_that_does_not_follow_is_named_and_presses_nothing(limit_s: float) -> None:
