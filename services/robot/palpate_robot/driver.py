@@ -32,6 +32,8 @@ class DriverTuning(NamedTuple):
     measured position (assumed)."""
     first_torque_nm: float = 20.0
     """Maximum first command per joint (assumed): the arm is at rest, and a set-point at its position needs almost no torque."""
+    further_n: float = 3.0
+    """Rise of a force above its limit, after a release of an arm that takes positions, that holds it again."""
     validity_ns: int = 50_000_000
     """Longest validity of a command, as in the contract, and longest interval counted since the previous one."""
     ahead_ns: int = 500_000_000
@@ -64,7 +66,7 @@ class Driver:
         self._arm, self._positions = arm, positions
         self._still = np.zeros(arm.joints)
         self._still.setflags(write=False)
-        self._force_emergency = force_emergency_n
+        self._force_emergency = self._force_limit = force_emergency_n
         self.mode = DriverMode.IDLE
         self.cause = HoldCause.NONE
         self.reason = self.culprit = ""
@@ -93,11 +95,16 @@ class Driver:
             self.holds.append((t, cause, reason))
 
     def release(self, t: int) -> None:
-        """Leave a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again."""
+        """Leave a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again.
+
+        Positions do not yield in a hold, so a force above its limit may stay after the release: it must only not rise.
+        """
         if self.mode is DriverMode.SAFE_HOLD:
             self.mode, self.cause, self.reason, self.culprit = DriverMode.IDLE, HoldCause.NONE, "", ""
             self._since = t
             self._before = None
+            if self._positions:
+                self._force_limit = np.inf  # until the next force
 
     def facts(self) -> dict[str, Any]:
         """Return mode, safe holds and the number of rejected commands, for the report."""
@@ -120,8 +127,9 @@ class Driver:
             return self._still
         if lost:
             self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control is lost", "control")
-        elif not force <= self._force_emergency:  # also for NaN
-            limit = self._force_emergency
+            return self._still
+        limit = self._force_limit = max(self._force_emergency, min(self._force_limit, force + TUNING.further_n))
+        if not force <= limit:  # also for NaN
             self.hold(t, HoldCause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
         else:
             self._check_joints(t, q, v)

@@ -160,6 +160,16 @@ def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None
     assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, HoldCause.POSITION_LIMIT)
 
 
+@pytest.mark.parametrize("positions", [False, True])
+def test_only_an_arm_of_positions_leaves_a_hold_with_too_much_force_and_not_while_it_rises(positions: bool) -> None:
+    driver = Driver(ARM, EMERGENCY, positions=positions)
+    for t, force in enumerate((0.0, 60.0, 60.0, 61.0, 50.0, 54.0)):
+        if driver.held:
+            driver.release(t * MS)
+        _update(driver, (t + 1) * MS, _command(t * MS + 1, np.array(lbr.HOME)) if positions else None, force=force)
+        assert driver.held == (force in (60.0, 54.0) and t != 2 if positions else force > EMERGENCY), t
+
+
 def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
     active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")

@@ -1,7 +1,7 @@
 """Latched stop: which breach latches it, when a soft stop escalates to an emergency stop, when a release is granted."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
 from palpate_bus.messages.codes import HoldCause, StopCause, StopLevel
 from palpate_supervisor.watch import Breach
@@ -14,6 +14,8 @@ class LatchTuning(NamedTuple):
     """Driver hold is ignored for this long after a release (message latency)."""
     further_m: float = 0.010
     """After a release, a tool that goes this much further beyond its limit is stopped again."""
+    further_n: float = 3.0
+    """As `further_m`, for a force."""
     over_ns: int = 1_000_000_000
     """The supervisor releases a harmless stop by itself after its cause has been over for this long."""
     own_releases_max: int = 3
@@ -21,8 +23,10 @@ class LatchTuning(NamedTuple):
 
 
 TUNING = LatchTuning()
-RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
-"""Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
+RECOVERABLE: Final = {StopCause.DEPTH: TUNING.further_m, StopCause.WORKSPACE: TUNING.further_m}
+"""Causes that only motion can end. After a release they are ignored until they are over or have grown by this much."""
+RECOVERABLE_STIFF: Final = RECOVERABLE | {StopCause.FORCE: TUNING.further_n}
+"""As `RECOVERABLE`, for an arm that takes positions: it does not yield in a hold, so a force stays."""
 _HARMLESS_HOLDS = (HoldCause.COMMAND_EXPIRED, HoldCause.FORCE_LIMIT, HoldCause.STOP_REQUESTED)
 HARMLESS = frozenset({(cause, HoldCause.NONE) for cause in (StopCause.FORCE, StopCause.SILENT)}) | {
     (StopCause.DRIVER, hold) for hold in _HARMLESS_HOLDS
@@ -42,7 +46,8 @@ class Stop(NamedTuple):
 class Latch:
     """StopLevel, cause, reason and culprit, kept until a release."""
 
-    def __init__(self) -> None:
+    def __init__(self, recoverable: Mapping[StopCause, float] = RECOVERABLE) -> None:
+        self._recoverable = recoverable
         self.level = StopLevel.OK
         self.cause = StopCause.NONE
         self.reason = self.culprit = ""
@@ -99,7 +104,7 @@ class Latch:
         released = self._recovering.get(breach.cause)
         if released is None:
             return False
-        return breach.level <= released.level and breach.beyond_m <= released.beyond_m + TUNING.further_m
+        return breach.level <= released.level and breach.beyond <= released.beyond + self._recoverable[breach.cause]
 
     def _latch(self, t: int, breach: Breach) -> None:
         self.level, self.cause, self.reason, self.culprit = breach.level, breach.cause, breach.reason, breach.culprit
@@ -108,12 +113,13 @@ class Latch:
 
     def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
         """Grant a release unless a breach that motion cannot end is present; return the breaches still to be judged."""
-        against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not StopCause.DRIVER]
+        ends = {StopCause.DRIVER, *self._recoverable}
+        against = [breach for breach in standing if breach.cause not in ends]
         if against:
             self.refusals += 1
             self.reason, self.culprit = f"release refused: {against[0].reason}", against[0].culprit
             return standing
-        self._recovering = {breach.cause: breach for breach in standing if breach.cause in RECOVERABLE}
+        self._recovering |= {breach.cause: breach for breach in standing if breach.cause in self._recoverable}
         self.level, self.cause, self.reason, self.culprit = StopLevel.OK, StopCause.NONE, "", ""
         self.releases += 1
         self._released = t

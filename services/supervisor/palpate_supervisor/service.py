@@ -13,10 +13,11 @@ from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
 from palpate_models.robot.arm import arm_of
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_supervisor.judge import DepthAgreement, MotionAgreement, SensorJudge
-from palpate_supervisor.latch import Latch
+from palpate_supervisor.latch import RECOVERABLE, RECOVERABLE_STIFF, Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, LimitWatch
@@ -64,12 +65,11 @@ class SupervisorService(Service):
         """Age limit of watched topics [ns]: the expiry of set-points. Control and driver check their own inputs faster."""
         self._judge, self._agreement, self._stated = SensorJudge(), MotionAgreement(), DepthAgreement(self._radius)
         self._disagreeing: list[Breach] = []
-        self._latch = Latch()
+        self._latch = Latch(RECOVERABLE_STIFF if known.robot.level is CommandLevel.POSITION else RECOVERABLE)
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
         self._measured: list[Breach] = []
         self._stamp: int | None = None
-        self._stamped = 0  # arrival of the newest distinct measurement [ns]
         self._depth = TUNING.no_depth_m
         self._peak_force = self._peak_speed = 0.0
 
@@ -164,7 +164,7 @@ class SupervisorService(Service):
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS
-            self._stamp, self._stamped = stamp, t
+            self._stamp = stamp
             clear = self._surface is not None and self._depth < -TUNING.clear_m
             self._tool = self._sense.sense(measured, since_s, clear)
             self._disagreeing = self._agreement.judge(measured, since_s)
@@ -176,10 +176,6 @@ class SupervisorService(Service):
         known = depth if above else None
         found = self._watch.judge(tool, known, stamp, t) + self._judge.judge(self._sense.comparison, known)
         found += self._disagreeing
-        if t - self._stamped > self._max_age:
-            age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-            reason = f"robot/status repeats a measurement of age {age}"
-            found.append(Breach(StopLevel.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
         return found + held
 
 

@@ -18,8 +18,6 @@ from palpate_supervisor.senses import BY_CURRENT, BY_SENSORS, ForceComparison, F
 class BiasTuning(NamedTuple):
     """Limits within which a reading counts as sensor bias."""
 
-    still_mps: float = 0.005
-    """Tool speed below which the tool is at rest."""
     longest_s: float = 1.0
     """Longest time of rest whose mean is the bias: a sensor that drifts while the arm waits must not be taken for true."""
     largest_n: float = 6.0
@@ -90,7 +88,7 @@ class ToolSense:
             residual = observed.J_W.T @ self._R_SW.T @ (force_S - inertia_S)
         speed = _norm(velocity_W)
         over = self._rested_s > TUNING.longest_s
-        self._moved = self._moved or over or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
+        self._moved = self._moved or over or speed > BY_SENSORS.still_mps or _norm(force_S) > TUNING.largest_n
         if not self._moved:
             self._rested, self._rested_s = self._rested + 1, self._rested_s + dt_s
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested

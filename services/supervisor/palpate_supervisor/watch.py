@@ -47,8 +47,8 @@ class Breach(NamedTuple):
     reason: str
     timeout_ns: int = TUNING.soft_stop_timeout_ns
     """Time that a soft stop has to end the breach."""
-    beyond_m: float = 0.0
-    """Distance beyond the limit of depth or workspace."""
+    beyond: float = 0.0
+    """Amount beyond the limit of depth or workspace [m], or of the soft stop's force [N]."""
     culprit: str = ""
     """Role or topic that is missing or invalid."""
     hold: int = HoldCause.NONE
@@ -92,10 +92,11 @@ class LimitWatch:
         if not (rising or lasting) and soon <= limits.force_emergency_n:
             return []
         found = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
+        level, limit = StopLevel.SOFT_STOP, f"soft-stop limit {limits.force_soft_stop_n:g} N"
         if not soon <= limits.force_emergency_n:
-            return [Breach(StopLevel.EMERGENCY, StopCause.FORCE, f"{found}, emergency limit {limits.force_emergency_n:g} N")]
+            level, limit = StopLevel.EMERGENCY, f"emergency limit {limits.force_emergency_n:g} N"
         timeout = TUNING.rising_timeout_ns if rising else TUNING.soft_stop_timeout_ns
-        return [Breach(StopLevel.SOFT_STOP, StopCause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
+        return [Breach(level, StopCause.FORCE, f"{found}, {limit}", timeout, soon - limits.force_soft_stop_n)]
 
     def _depth(self, depth: float) -> list[Breach]:
         limit = self._limits.depth_m + TUNING.depth_margin_m
@@ -103,7 +104,7 @@ class LimitWatch:
             return []
         level = StopLevel.EMERGENCY if depth > limit + TUNING.depth_margin_m else StopLevel.SOFT_STOP
         reason = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
-        return [Breach(level, StopCause.DEPTH, reason, beyond_m=depth - limit)]
+        return [Breach(level, StopCause.DEPTH, reason, beyond=depth - limit)]
 
     def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * TUNING.speed_margin
@@ -123,4 +124,4 @@ class LimitWatch:
         if beyond[k] <= 0.0:
             return []
         reason = f"tool at {'xyz'[k]} = {p_A[k]:.3f} m in the abdomen frame, allowed {low[k]:g} to {high[k]:g} m"
-        return [Breach(StopLevel.EMERGENCY, StopCause.WORKSPACE, reason, beyond_m=float(beyond[k]))]
+        return [Breach(StopLevel.EMERGENCY, StopCause.WORKSPACE, reason, beyond=float(beyond[k]))]
