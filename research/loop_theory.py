@@ -143,7 +143,7 @@ def admittance_gain(contrast: float, yield_s: float = ADMITTANCE.yield_s) -> flo
 def _torque(model: ArmModel, reference: Reference, q: Array, qd: Array) -> Array:
     """The controller's torques, Coriolis torques taken off [N m], shape (7,); from a fresh one, as it limits their rate."""
     torque = ImpedanceController(model).command(q, qd, reference)
-    return np.asarray(torque - model.coriolis)
+    return np.asarray(torque - (model.bias - model.gravity))
 
 
 def tissue_response(contrast: float) -> Array:

@@ -57,7 +57,7 @@ TUNING = AdmittanceTuning()
 class AdmittanceController:
     """The law for one arm; it keeps the commanded joint positions."""
 
-    def __init__(self, model: ArmModel, arm: Arm, tool_mass_kg: float, limit_zone: float = 0.05, reading_s: float = 0.01) -> None:
+    def __init__(self, model: ArmModel, arm: Arm, tool_mass_kg: float, limit_zone: float, reading_s: float) -> None:
         """Create a controller with an F/T reading every `reading_s`.
 
         It stays `limit_zone` [rad] away from joint limits where it starts there.
@@ -81,7 +81,7 @@ class AdmittanceController:
         self._rate = np.zeros(self.model.joints)
         self._yield = np.zeros(3)
 
-    def sense(self, force_S: Array, *, commanded: bool = True) -> None:
+    def sense(self, force_S: Array, *, commanded: bool) -> None:
         """Take an F/T reading: force in the sensor's axes, not tared [N], shape (3,).
 
         `commanded`: the driver executes the commands. While it holds the arm, the arm may be in contact.

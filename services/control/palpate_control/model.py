@@ -56,11 +56,6 @@ class ArmModel:
         """Evaluate `gravity` only, for joint-space control."""
         pin.computeGeneralizedGravity(self._model, self._data, q)
 
-    @property
-    def coriolis(self) -> Array:
-        """Return Coriolis and centrifugal torques C(q, qd) qd [N m], shape (n,)."""
-        return self.bias - self.gravity
-
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the torques for accelerations `qdd` [rad/s^2], with gravity and without friction [N m], shape (n,)."""
         torque: Array = pin.rnea(self._model, self._data, q, qd, qdd)

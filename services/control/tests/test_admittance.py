@@ -17,6 +17,8 @@ from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.scenario.schema import Robot
 
 MASS, REST = 0.35, np.zeros(7)
+ZONE = 0.05, 0.01
+"""Limit zone [rad] and time between readings [s]."""
 BIAS = np.array((1.5, -2.0, 3.0))
 PUSH = np.array((0.0, 0.0, 10.0))
 SETTLED = round(8 * TUNING.yield_s * 1e3)
@@ -28,7 +30,7 @@ class Contact:
     def __init__(self, posture: int = 1) -> None:
         self.asked, self.q = WORKING[posture], np.array(WORKING[posture])
         self.model = ArmModel(urdf(Robot()))
-        self.law = AdmittanceController(self.model, lbr.ARM, MASS)
+        self.law = AdmittanceController(self.model, lbr.ARM, MASS, *ZONE)
         self.t = 0
 
     def follow(self, mode: ControlMode, force_W: np.ndarray, ticks: int = SETTLED, held: bool = False, **changes: Any) -> Any:
@@ -114,7 +116,7 @@ def test_beside_a_path_through_a_singular_wrist_the_tool_tilts_and_stays_in_plac
     pytest.importorskip("coal")
     robot = Robot(arm="ur5")
     model = ArmModel(urdf(robot))
-    law, aside = AdmittanceController(model, arm_of(robot), MASS), np.array((0.0, beside_m, 0.0))
+    law, aside = AdmittanceController(model, arm_of(robot), MASS, *ZONE), np.array((0.0, beside_m, 0.0))
     start, travel = np.array((0.3, -1.2, 1.9, -2.2, 0.25, 0.0)), np.array((0.0, 0.0, 0.0, 0.0, -0.5, 0.0))
     q, off, fastest = start, np.zeros(3), 0.0
     for ms in range(2000):

@@ -156,7 +156,7 @@ def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: 
     qd_d = qd_0 + J_bar @ (twist - J @ qd_0)
     friction = D @ qd_d + arm.coulomb_friction * qd_d / (np.abs(qd_d) + impedance.LAW.stiction_speed_radps)
     F = X.T @ (B * (X @ (twist - J @ qd)))
-    expected = J.T @ (F + F_W) + (np.eye(7) - J.T @ J_bar.T) @ tau_0 + arm.coriolis + friction
+    expected = J.T @ (F + F_W) + (np.eye(7) - J.T @ J_bar.T) @ tau_0 + arm.bias - arm.gravity + friction
     np.testing.assert_allclose(torque, expected, rtol=1e-4, atol=1e-4)
 
 
