@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.port_check import RefusedMessage
+from palpate_bus.contract.port_check import Checker, RefusedMessage
 from palpate_bus.messages import MS, Message, RobotStatus, Vector3, Wrench, codec, header
 from palpate_bus.runtime.lockstep import Outgoing, Packet, Stepper
 from palpate_bus.service import Service
@@ -210,6 +210,7 @@ class ServiceRig(Rig):
         self._steps: MutableSequence[int] = [0] if steps is None else steps
         self._stepper = Stepper(service, self.contract, strict=False, refuse=self._log_refused)
         self._sequences = dict.fromkeys(self._stepper.buffers, 0)
+        self._checks = {name: Checker(self.contract.topics[name]) for name in self._stepper.buffers}
         self._take(self._stepper.start())
 
     def _advance(self, end: int, feed: Feed) -> None:
@@ -224,7 +225,9 @@ class ServiceRig(Rig):
             self.t += MS
 
     def send(self, topic: str, message: Message) -> None:
-        """Deliver a message as bytes, like the wire."""
+        """Deliver a message as bytes, like the wire. A port refuses one that breaks its row of the contract."""
+        if self._checks[topic](message):
+            return
         self._sequences[topic] += 1
         payload = codec.encode(message, self.contract.topics[topic].type)
         self._stepper.buffers[topic].deliver(Packet(payload, self.t, self._sequences[topic], checked=True))

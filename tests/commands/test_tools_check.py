@@ -12,7 +12,7 @@ import pytest
 
 from palpate.check.perform import LiveRig, start_implementation
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites import SUITES, check, robot
+from palpate.check.suites import SUITES, check, control, robot
 from palpate.check.suites.tissue import STILL
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.implementations import create, kind
@@ -126,6 +126,14 @@ def test_a_robot_is_not_moved_without_consent() -> None:
     assert any("--motion" in result.got for result in report.results)
     q = np.array([logged.message.position for logged in rig.log["joint_states"]])
     assert np.ptp(q, axis=0).max() < 1e-3
+
+
+def test_a_service_is_fed_through_the_check_of_its_ports() -> None:
+    rig = ServiceRig(made("control"), RigSettings(SCENARIO))
+    arm = control.Played(rig)
+    for q, count in ((np.nan * arm.home, 0), (arm.home, 1)):
+        rig.send("joint_states", arm.joints(q)(0))
+        assert len(rig._stepper.buffers["joint_states"].pending) == count
 
 
 class RefusingRig(ServiceRig):

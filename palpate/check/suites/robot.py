@@ -28,9 +28,9 @@ class RobotTouches(NamedTuple):
     ripple_nm: float = 1e-3
     """Alternating part of a torque for a live arm: its port refuses a command that repeats for half a second."""
     beyond: float = 1.02
-    """Torque beyond its limit for a live arm, over the limit: a driver that does not check it applies it."""
+    """Torque beyond its limit, over the limit: a driver that does not check it applies it."""
     jump_rad: float = 0.1
-    """Jump of a position for a live arm: more than the fastest joint travels within a few ms."""
+    """Jump of a position: more than the fastest joint travels within a few ms."""
     moved_rad: float = 2e-4
     drift_rad: float = 0.05
     press_n: float = 10.0
@@ -217,15 +217,15 @@ def _expiry(rig: Rig) -> None:
 
 
 def _provoke(rig: Rig, what: str, push: Any, cause: int, *, refusable: bool = True) -> None:
-    """Expect a hold for a command while commands continue.
+    """Expect a hold for a command that is sent once, while commands continue.
 
-    A live arm is sent it once. One that is `refusable` its port may keep from the driver, which then stays active.
+    One that is `refusable` the port may keep from the driver, which then stays active.
     """
     _activate(rig)
-    received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig), first=push) if rig.live else commanding(rig, push))
+    received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig), first=push))
     share = max((_effort_share(rig, item.message) for item in received["joint_states"]), default=np.inf)
     last = rig.last("robot/status")
-    if rig.live and refusable and share <= 1.0 and last is not None and last.mode == RobotStatus.MODE_ACTIVE:
+    if refusable and share <= 1.0 and last is not None and last.mode == RobotStatus.MODE_ACTIVE:
         rig.expect(f"{what} is not applied", ok=True, expected="efforts within their limits", got=f"{share:.2g} of the limit")
     else:
         _expect_hold(rig, f"{what} makes it hold", received["robot/status"], cause)
@@ -242,10 +242,10 @@ def _invalid(rig: Rig) -> None:
     _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
     huge = _still(rig)
     if _positions(rig):
-        huge[0] = TOUCH.jump_rad if rig.live else 1.0
+        huge[0] = TOUCH.jump_rad
         _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND, refusable=False)
         return
-    huge[0] = (TOUCH.beyond if rig.live else 10) * _arm(rig).torque_nm[0]
+    huge[0] = TOUCH.beyond * _arm(rig).torque_nm[0]
     _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 

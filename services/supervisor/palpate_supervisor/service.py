@@ -1,7 +1,6 @@
 """Supervisor service: converts messages to numbers and publishes the latched stop."""
 
 from collections.abc import Mapping
-from math import isfinite
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -157,10 +156,6 @@ class SupervisorService(Service):
         measured = Measurement(
             np.array(status.position), np.array(status.velocity), wrench(status.wrench), np.array(status.measured_torque)
         )
-        wrong = next((name for name, value in measured._asdict().items() if not isfinite(value.dot(value))), "")
-        if wrong:
-            reason = f"robot/status: {wrong} = {getattr(measured, wrong)}: must be finite"
-            return [Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS

@@ -112,12 +112,10 @@ class RestSurface:
     def __init__(self, vertices_W: Array, normals_W: Array, radius: float) -> None:
         """Take vertices [m] and outward unit normals, shapes (n, 3), and the sphere's `radius` [m].
 
-        Raises ValueError for an empty mesh, different shapes, or values that are not finite.
+        Raises ValueError for an empty mesh or different shapes.
         """
         if vertices_W.shape != normals_W.shape or not len(vertices_W):
             raise ValueError(f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: expected one shape")
-        if not (np.isfinite(vertices_W).all() and np.isfinite(normals_W).all()):
-            raise ValueError("perceived surface: vertices and normals must be finite")
         self._vertices, self._normals, self._radius = np.ascontiguousarray(vertices_W, float), normals_W, radius
 
     def depth(self, p_W: Array) -> tuple[float, bool]:

@@ -170,10 +170,9 @@ def test_depth_over_a_dome_is_that_of_geometry() -> None:
     assert not surface.depth(np.array((0.08, 0.0, 0.2)))[1], "it is not over the surface"
 
 
-@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
-def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
+def test_a_surface_that_is_none_says_so() -> None:
     with pytest.raises(ValueError, match="perceived surface"):
-        RestSurface(bad, bad, 0.015)
+        RestSurface(np.zeros((0, 3)), np.zeros((0, 3)), 0.015)
 
 
 SOFT = Breach(StopLevel.SOFT_STOP, StopCause.FORCE, "26 N")

@@ -131,8 +131,7 @@ class PerceivedSurface:
         """Fit the field to a mesh.
 
         Slopes come from the normals if given (perception smooths them), else from the heights. Outside the mesh the height and
-        slope of the nearest vertex are used. Raises ValueError for fewer than four vertices, no extent, or values that are not
-        finite.
+        slope of the nearest vertex are used. Raises ValueError for fewer than four vertices or no extent.
 
         Args:
             vertices_W: vertices [m], shape (n, 3).
@@ -142,8 +141,6 @@ class PerceivedSurface:
         """
         if len(vertices_W) < 4:
             raise ValueError(f"perceived surface has {len(vertices_W)} vertices, at least 4 are needed")
-        if not (np.isfinite(vertices_W).all() and (normals_W is None or np.isfinite(normals_W).all())):
-            raise ValueError("perceived surface has vertices or normals that are not finite")
         p_A = apply(inverse(X_WA), np.asarray(vertices_W, dtype=float))
         xy = p_A[:, :2]
         low, high = xy.min(axis=0), xy.max(axis=0)
