@@ -184,7 +184,7 @@ def release(rig: Rig) -> None:
 
 
 def _activate(rig: Rig) -> None:
-    rig.run(0.1 + rig.slack_s, quiet(rig))  # commands of before expire, and hold, before the release
+    rig.run(0.1 + rig.slack_s, quiet(rig))  # earlier commands expire, and hold, before the release
     release(rig)
     rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig)))
 

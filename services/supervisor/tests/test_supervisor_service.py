@@ -282,7 +282,7 @@ def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
 
 
 def test_an_arm_of_positions_may_lift_after_a_release_while_its_force_does_not_rise() -> None:
-    latch, t = Latch(latch_module.RECOVERABLE_STIFF), 0
+    latch, t = create(load_scenario("clean", ["robot.arm=ur5"]))._latch, 0
     for force, level in ((45.0, 2), (45.0, 0), (46.0, 0), (30.0, 0), (46.0, 0), (49.0, 2)):
         latch.update(t := t + 10 * MS, judge(force), force == 45.0 and latch.level is StopLevel.EMERGENCY)
         assert latch.level == level, force
