@@ -386,7 +386,7 @@ def test_a_wall_that_is_calm_for_a_moment_ends_within_the_bound(calm_s: float, e
     world.watch(flicker)
     assert world.end == (Phase.ABORTED, Reason.WALL_NOT_TRACKED), "no tissue was measured"
     assert world.reasons[Reason.WAITS_FOR_WALL] - began < WAIT.reported_s + 2.0
-    assert world.t / SECOND - began < limit_s * (1.0 + calm_s / (every_s - calm_s)) + 15.0
+    assert world.t / SECOND - began < limit_s * (1.0 + calm_s / (every_s - calm_s)) + 5.0
 
 
 @pytest.mark.usefixtures("limit_s")
@@ -418,7 +418,7 @@ def test_a_search_without_requests_ends_the_strokes(limit_s: float) -> None:
     assert world.status.phase is Phase.DONE, world.status.message
     assert world.reasons[Reason.WAITS_FOR_REQUEST] - began < WAIT.reported_s + 0.1
     assert Reason.NO_REQUEST in world.reasons
-    assert world.t / SECOND - began < limit_s + 15.0
+    assert world.t / SECOND - began < limit_s + 5.0
 
 
 class _HangingPlan(BackgroundTask[Any]):
