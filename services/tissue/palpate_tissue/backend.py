@@ -8,8 +8,10 @@ import numpy as np
 from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.schema import Stiffness
 from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
+from palpate_tissue.contact import skin
 
 
 def require_finite(motion: Array) -> None:
@@ -96,3 +98,26 @@ class TissueBackend(ABC):
     def excursion(self, t_s: float) -> float:
         """Return the breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
         return self.breathing.excursion(t_s)
+
+
+class SkinBody(TissueBackend):
+    """A body whose skin shears under the sphere."""
+
+    def __init__(self, model: PhantomModel, stiffness: Stiffness | None, breathing: BreathingCurve, dt: float) -> None:
+        super().__init__(model, breathing, dt)
+        self._stiffness = stiffness or Stiffness()
+        self.friction = skin(self._stiffness.friction, model.background)
+        self.disturbed = False
+        """True once anything has moved."""
+        self._excursion = 0.0
+
+    def settle(self) -> None:
+        """See `TissueBackend`."""
+        self.friction.release()
+        self.touching = self.disturbed = False
+        self.activation, self._excursion = 1.0, 0.0
+
+    def _set_touching(self, touching: bool) -> None:
+        if self.touching and not touching:
+            self.friction.release()
+        self.touching = touching

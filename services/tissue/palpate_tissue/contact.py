@@ -142,6 +142,33 @@ class Push(NamedTuple):
 
 
 @compiled
+def meet(p: Vector, radius: float, X: Vector, n: Vector) -> tuple[Vector, float, float]:
+    """Return d, s and c of a sphere of `radius` [m] at `p` above a vertex X with outward normal n; c = 0 where it cannot hold it.
+
+    The vertex moves along n. With d = p - X and s = -d.n it meets the sphere's lower side at a displacement w = s + c inward,
+    c^2 = R^2 - |d|^2 + s^2.
+    """
+    d = subtract(p, X)
+    s = -dot(n, d)
+    square = radius * radius - dot(d, d) + s * s
+    return d, s, math.sqrt(square) if square > radius * radius * RIM * RIM else 0.0
+
+
+@compiled
+def add_vertex(push: Push, f: float, n: Vector, d: Vector, s: float, c: float, w: float) -> Push:
+    """Return a push, whose arm is not yet divided by the load, with the force `f` [N] along n of a vertex held at w = s + c.
+
+    The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c): f is the component along n, and the guidance
+    of the vertex takes the rest. Since f holds the vertex exactly on the sphere, tool and field exchange equal work.
+    """
+    force = add(push.force, add(scale(f, n), scale(f / c, add(d, scale(s, n)))))
+    return Push(force, add(push.normal, scale(f, n)), subtract(push.arm, scale(f, add(d, scale(w, n)))))  # it is at X - w n
+
+
+NO_PUSH: Final = Push((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+@compiled
 def shear(bristle: Bristle, velocity: Vector, normal: Vector, load: float, h: float) -> Vector:
     """Return the friction force on the indenter [N] after `h` [s].
 

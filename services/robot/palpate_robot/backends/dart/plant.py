@@ -29,7 +29,7 @@ from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.kinematics import Kinematics
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal_arm
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench, nominal_arm
 
 
 class ClearanceTuning(NamedTuple):
@@ -117,8 +117,8 @@ def _environment(robot: Robot) -> Any:
     return skeleton
 
 
-class DartPlant:
-    """The arm with its tool. Arrays of joints have shape (n,), from the base to the flange; units N, N m, m, rad, s."""
+class DartPlant(Plant):
+    """The arm with its tool."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
         """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
@@ -160,12 +160,6 @@ class DartPlant:
         self._viscous = robot.joint_damping_nms * drawn.damping
         self._coulomb = robot.joint_friction_nm * drawn.friction
         self._cached_state: Array | None = None
-        self.q: Array
-        """Joint positions [rad], a fresh array at every step."""
-        self.v: Array
-        """Joint velocities [rad/s], a fresh array at every step."""
-        self.friction: Array
-        """Torque of friction and damping in the last step [N m], a fresh array at every step."""
         self.reset(arm.home_rad if q is None else q)
 
     @staticmethod
@@ -189,11 +183,7 @@ class DartPlant:
         self._free_travel, self._check_in = 0.0, 0
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
-        """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
-
-        `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
-        centre, in world axes, and is held over the step; None for the force where nothing touches.
-        """
+        """See `Plant`."""
         slopes = self._viscous + damping + self._coulomb / np.maximum(np.abs(self.v), STICK_RADPS)
         for set_damping, slope in zip(self._set_damping, slopes.tolist(), strict=True):
             set_damping(slope)
@@ -229,7 +219,7 @@ class DartPlant:
         return clear
 
     def gravity_torque(self) -> Array:
-        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (n,)."""
+        """See `Plant`."""
         return self._state()[13:]
 
     def _state(self) -> Array:
@@ -248,21 +238,9 @@ class DartPlant:
         return -fx, -fy, -fz, -mx, -my, -mz
 
     def tool_motion(self) -> Array:
-        """Return the indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
-
-        The linear velocity is that of the sphere's centre.
-        """
+        """See `Plant`."""
         return self._state()[:13]
 
     def link_poses(self) -> Array:
-        """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
+        """See `Plant`."""
         return self._kinematics.links(self.q)
-
-    def link_pose(self, link: str) -> tuple[Array, Any]:
-        """Return DART's position [m], shape (3,), and quaternion of a link in world."""
-        X_WL = self._links[link].getTransform()  # in world; dartpy takes longer over `getWorldTransform`
-        return X_WL.translation(), X_WL.quaternion()
-
-    def contacts(self) -> int:
-        """Return the number of contact points with table or base in the last step."""
-        return 0 if self._free_travel > CLEARANCE.min_rad else int(self._world.getLastCollisionResult().getNumContacts())

@@ -25,7 +25,7 @@ from palpate_models.robot.chain import Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal_arm
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench, nominal_arm
 
 SUBSTEPS: Final = 2
 """Integration steps per millisecond: different from the DART plant, so that effects of the step size show."""
@@ -120,8 +120,8 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
     return spec.compile()
 
 
-class MujocoPlant:
-    """The arm with its tool. Arrays of joints have shape (n,), from the base to the flange; units N, N m, m, rad, s."""
+class MujocoPlant(Plant):
+    """The arm with its tool."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
         """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
@@ -145,13 +145,6 @@ class MujocoPlant:
         self._coulomb = robot.joint_friction_nm * drawn.friction
         self._jacobian = np.zeros((3, arm.joints))
         self._twist = np.zeros(6)
-        self._contacts = 0
-        self.q: Array
-        """Joint positions [rad], a fresh array at every step."""
-        self.v: Array
-        """Joint velocities [rad/s], a fresh array at every step."""
-        self.friction: Array
-        """Torque of friction and damping, mean of the last step [N m], a fresh array at every step."""
         self.reset(arm.home_rad if q is None else q)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
@@ -166,11 +159,7 @@ class MujocoPlant:
         self.q, self.v, self.friction = self._qpos.copy(), self._qvel.copy(), np.zeros_like(self._qvel)
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
-        """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
-
-        `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
-        centre (its centre of mass), in world axes, and is held over the step.
-        """
+        """See `Plant`. The sphere's centre is its centre of mass; `friction` is the mean of the step."""
         model, data, v = self._model, self._data, self._qvel
         self._joint_torque[:] = torque
         self._force_W[:] = 0.0 if force_W is None else force_W
@@ -187,7 +176,6 @@ class MujocoPlant:
             np.multiply(v - before, SUBSTEPS / DT, out=self._qacc)
             mujoco.mj_rnePostConstraint(model, data)
             mujoco.mj_sensorAcc(model, data)
-            self._contacts = int(data.ncon)
             mujoco.mj_fwdPosition(model, data)
         mujoco.mj_comVel(model, data)
         self.q, self.v = self._qpos.copy(), v.copy()
@@ -214,20 +202,13 @@ class MujocoPlant:
         return -fx, -fy, -fz, -mx, -my, -mz
 
     def tool_motion(self) -> Array:
-        """Return the indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
-
-        The linear velocity is that of the sphere's centre.
-        """
+        """See `Plant`."""
         body, twist = self._indenter, self._twist
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
         quaternion = self._xquat[body]  # w first
         return np.concatenate((self._xpos[body], quaternion[1:], quaternion[:1], twist[3:], twist[:3]))
 
     def link_poses(self) -> Array:
-        """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
+        """See `Plant`."""
         quaternions = self._xquat[self._bodies]  # w first
         return np.column_stack((self._xpos[self._bodies], quaternions[:, 1:], quaternions[:, :1]))
-
-    def contacts(self) -> int:
-        """Return the number of contact points with table or base in the last step."""
-        return self._contacts

@@ -20,10 +20,10 @@ from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend, require_finite
+from palpate_tissue.backend import SkinBody, TissueBackend, require_finite
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPatch, VertexSprings
-from palpate_tissue.contact import Sphere, VertexSearch, add_friction, skin
+from palpate_tissue.contact import Sphere, VertexSearch, add_friction
 
 
 class ElasticTuning(NamedTuple):
@@ -62,7 +62,7 @@ def update_rule(stiffness: Stiffness, dt: float) -> tuple[Array, Array]:
     return advance, share * np.concatenate(([1.0], intake))
 
 
-class ElasticTissue(TissueBackend):
+class ElasticTissue(SkinBody):
     """A soft solid pressed by a sphere. The step is stable for any mesh."""
 
     substeps = 1
@@ -75,14 +75,10 @@ class ElasticTissue(TissueBackend):
         breathing: BreathingCurve = STILL,
         dt: float = 1e-3,
     ) -> None:
-        stiffness = stiffness or Stiffness()
-        super().__init__(model, breathing, dt)
+        super().__init__(model, stiffness, breathing, dt)
         self.compliance = compliance
-        self.friction = skin(stiffness.friction, model.background)
-        self.disturbed = False
-        self._prony_g, self._stiffness = stiffness.prony_g, stiffness
-        self._advance, self._feed = update_rule(stiffness, dt)
-        self._excursion = 0.0
+        self._prony_g = self._stiffness.prony_g
+        self._advance, self._feed = update_rule(self._stiffness, dt)
         free = compliance.free
         self._breathing = model.breathing[free]
         self._springs = VertexSprings(
@@ -112,12 +108,13 @@ class ElasticTissue(TissueBackend):
         self._behind += 1
         wrench = np.zeros(6)
         if len(patch.vertex) and patch.step(w, self._advance, self._feed, self.activation):
-            self.touching = self.disturbed = True
+            self.disturbed = True
+            self._set_touching(True)
             sphere = Sphere(tuple(p), tuple(velocity), tuple(spin), radius)
             add_friction(self.friction, sphere, patch.push(), self.dt, wrench)
             self.guard(v_A)
         else:
-            self._release()
+            self._set_touching(False)
         return wrench[:3], wrench[3:]
 
     def idle(self, t_s: float) -> None:
@@ -126,15 +123,13 @@ class ElasticTissue(TissueBackend):
         self._catch_up()
         self._patch = None
         self._behind += 1
-        self._release()
+        self._set_touching(False)
 
     def settle(self) -> None:
         """See `TissueBackend`."""
+        super().settle()
         self._state[:] = 0.0
-        self._behind, self._excursion, self._patch = 0, 0.0, None
-        self.friction.release()
-        self.disturbed = self.touching = False
-        self.activation = 1.0
+        self._behind, self._patch = 0, None
 
     def in_steps_of(self, dt: float) -> TissueBackend:
         """See `TissueBackend`."""
@@ -146,11 +141,6 @@ class ElasticTissue(TissueBackend):
             return super().press(places, normals, radius)
         coarse = ElasticTissue(self.model, self.compliance, self._stiffness, dt=TUNING.press_step_s)
         return coarse.press(places, normals, radius)
-
-    def _release(self) -> None:
-        if self.touching:
-            self.touching = False
-            self.friction.release()
 
     def _catch_up(self) -> None:
         """Advance all vertices to the present."""

@@ -11,7 +11,6 @@ mean force is 0.14 to 0.53 % too large, more for longer Pasternak lengths (perso
 at 10 mm depth on each). `docs/scoring.md` compares forces with those of the explicit steps.
 """
 
-from math import sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,14 +19,14 @@ from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Indices
-from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
+from palpate_models.numerics.vectors import divide, row
 from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend, require_finite
+from palpate_tissue.backend import SkinBody, require_finite
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
-from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
+from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, VertexSearch, add_friction, add_vertex, meet
 
 SWEEPS = 3
 """Over-relaxation sweeps per step near the sphere."""
@@ -114,15 +113,12 @@ def press(
     for k in range(len(near)):
         room[k, 0], room[k, 1] = u[near[k]], -np.inf
     for k in range(len(table)):
-        d = subtract(sphere.p, row(table, k, 3))
-        along = -dot(row(table, k, 0), d)
-        square = radius * radius - dot(d, d) + along * along
-        if square > radius * radius * RIM * RIM:
-            room[patch.within[k], 1] = along + sqrt(square) + excursion * table[k, 6]
+        _, s, c = meet(sphere.p, radius, row(table, k, 3), row(table, k, 0))
+        if c > 0.0:
+            room[patch.within[k], 1] = s + c + excursion * table[k, 6]
     for _ in range(SWEEPS):
         sweep(wall, near, room, activation, OWN)
-    load = 0.0
-    force = normal = weighted_arm = (0.0, 0.0, 0.0)
+    load, push = 0.0, NO_PUSH
     for k in range(len(table)):
         at = patch.within[k]
         patch.f[k] = 0.0
@@ -131,19 +127,16 @@ def press(
         f = -pull(wall, near[at], room[at, 0], activation, 1.0, 1.0)[0]
         if f <= 0.0:
             continue
-        n, d = row(table, k, 0), subtract(sphere.p, row(table, k, 3))
-        along = -dot(n, d)
-        w = room[at, 1] - excursion * table[k, 6]
+        n, w = row(table, k, 0), room[at, 1] - excursion * table[k, 6]
+        d, s, _ = meet(sphere.p, radius, row(table, k, 3), n)
         patch.f[k] = f
         load += f
-        normal = add(normal, scale(f, n))
-        force = add(force, add(scale(f, n), scale(f / (w - along), add(d, scale(along, n)))))
-        weighted_arm = subtract(weighted_arm, scale(f, add(d, scale(w, n))))  # as in `tissue.hold`
+        push = add_vertex(push, f, n, d, s, w - s, w)
     relax(wall, near)
     wrench = np.zeros(6)
     if load <= 0.0:
         return False, wrench
-    add_friction(bristle, sphere, Push(force, normal, divide(weighted_arm, load)), h, wrench)
+    add_friction(bristle, sphere, Push(push.force, push.normal, divide(push.arm, load)), h, wrench)
     return True, wrench
 
 
@@ -248,23 +241,20 @@ TUNING: Final = ImplicitTuning()
 _NONE: Indices = np.empty(0, dtype=np.intp)
 
 
-class ImplicitTissue(TissueBackend):
+class ImplicitTissue(SkinBody):
     """A soft surface pressed by a sphere, in unconditionally stable steps."""
 
     def __init__(
         self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 0.01
     ) -> None:
-        stiffness = stiffness or Stiffness()
-        super().__init__(model, breathing, dt)
-        self.friction = skin(stiffness.friction, model.background)
-        self._reach_m = TUNING.reach_lengths * stiffness.length_m
+        super().__init__(model, stiffness, breathing, dt)
+        self._reach_m = TUNING.reach_lengths * self._stiffness.length_m
         self._every = max(1, round(TUNING.far_s / dt))
-        self._wall = implicit_wall(model, stiffness, dt, self._every)
+        self._wall = implicit_wall(model, self._stiffness, dt, self._every)
         self._free = np.flatnonzero(~model.fixed)
         self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, TUNING.margin_m)
         self._tree = cKDTree(model.vertices[self._free])
         self._steps = self._sprung = 0
-        self._excursion = 0.0
         self._near: Near | None = None
         self._patch: ImplicitPatch | None = None
         self._motion: Array = np.zeros((3, 3))
@@ -280,9 +270,7 @@ class ImplicitTissue(TissueBackend):
         touching, wrench = press(
             self._wall, self._patch, self.friction, motion, radius, self._excursion, self.activation, self.dt
         )
-        if self.touching and not touching:
-            self.friction.release()
-        self.touching = touching
+        self._set_touching(touching)
         self.guard(v_A)
         return wrench[:3], wrench[3:]
 
@@ -290,22 +278,15 @@ class ImplicitTissue(TissueBackend):
         """See `TissueBackend`."""
         self._leave()
         self._tick(t_s)
-        if self.touching:
-            self.friction.release()
-            self.touching = False
+        self._set_touching(False)
 
     def settle(self) -> None:
         """See `TissueBackend`."""
-        state = self._wall
-        state.u[:] = state.s[:] = 0.0
-        state.y[:] = 0.0
-        state.clock[:] = 0
+        super().settle()
+        for state in (self._wall.u, self._wall.s, self._wall.y, self._wall.clock):
+            state[:] = 0
         self._steps = self._sprung = 0
-        self._excursion = 0.0
         self._near = self._patch = None
-        self.friction.release()
-        self.touching = False
-        self.activation = 1.0
 
     def _tick(self, t_s: float) -> None:
         """Count a step, and advance the vertices far from the sphere when due."""

@@ -10,7 +10,7 @@ muscle depends only on its depth and speed, so it is the same for all presses.
 """
 
 from collections.abc import Sequence
-from math import exp, sqrt
+from math import exp
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from palpate_models.patient.schema import Stiffness
 from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
 from palpate_tissue.backends.winkler.implicit import TUNING, ImplicitWall, Stride, implicit_wall, pull, sweep
-from palpate_tissue.contact import RIM
+from palpate_tissue.contact import meet
 
 ENDS_S: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, press.DURATION_S - 0.5 * press.READ_S)
 """Ends of the steps after the touch [s]: full depth, where the force is largest, and last the middle of the reading."""
@@ -163,20 +163,16 @@ def press_once(wall: ImplicitWall, skin: Skin, part: Indices, at: Array, course:
 
 @compiled
 def floor(X: Vector, n: Vector, p: Vector, radius: float, normal: Vector) -> float:
-    """Return the least displacement [m] that a sphere at p allows a vertex X with outward normal n: w in `tissue.hold`."""
-    d = subtract(p, X)
-    along = -dot(n, d)
-    square = radius * radius - dot(d, d) + along * along
-    if square <= radius * radius * RIM * RIM or dot(n, normal) <= 0.0:  # outside it, or on the far side of a thin body
-        return -np.inf
-    return along + sqrt(square)
+    """Return the least displacement [m] that a sphere at p allows a vertex X with outward normal n."""
+    _, s, c = meet(p, radius, X, n)
+    return s + c if c > 0.0 and dot(n, normal) > 0.0 else -np.inf  # outside it, or on the far side of a thin body
 
 
 @compiled
 def hold_force(
     wall: ImplicitWall, skin: Skin, part: Indices, room: Array, activation: float, h: float, p: Vector, normal: Vector
 ) -> float:
-    """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, as in `tissue.hold`."""
+    """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, see `contact.add_vertex`."""
     total = 0.0
     for k in range(len(part)):
         i = part[k]

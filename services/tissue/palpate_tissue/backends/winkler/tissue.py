@@ -15,7 +15,6 @@ step is
 The README has the derivation. The FMU's C source has the same equations.
 """
 
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -23,16 +22,16 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Indices, Mask
-from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
+from palpate_models.numerics.vectors import divide, row
 from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend, require_finite
+from palpate_tissue.backend import SkinBody, TissueBackend, require_finite
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.backends.winkler.presses import standard_presses
-from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
+from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, VertexSearch, add_friction, add_vertex, meet
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: numba checks signed indices for negative values, which doubles the cost of the step."""
@@ -141,39 +140,28 @@ def stiffen(wall: Membrane) -> None:
 
 @compiled
 def hold(wall: Membrane, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
-    """Move the vertices under the sphere onto its surface at a breathing `excursion` [m]; return if there are any, and the push.
+    """Move the vertices under the sphere onto its surface at a breathing `excursion` [m]; return True if any, and the push.
 
-    A vertex X with outward normal n moves along it. With d = p - X and s = -d.n it meets the sphere's lower side at w = s + c,
-    c^2 = R^2 - |d|^2 + s^2. The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c): f is the component
-    along n, and the guidance of the vertex takes the rest. Since f holds the vertex exactly on the sphere, tool and field
-    exchange equal work.
+    See `contact.meet` and `contact.add_vertex`.
     """
-    u, R, table = wall.u, sphere.radius, patch.table
-    load = 0.0
-    force = normal = moment = (0.0, 0.0, 0.0)
+    u, table = wall.u, patch.table
+    load, push = 0.0, NO_PUSH
     for k in range(len(patch.vertex)):
         patch.f[k] = 0.0
         i, n = patch.vertex[k], row(table, k, _N)
-        d = subtract(sphere.p, row(table, k, _X))
-        s = -dot(n, d)
-        square = R * R - dot(d, d) + s * s
-        if square <= R * R * RIM * RIM:
-            continue
-        c = sqrt(square)
+        d, s, c = meet(sphere.p, sphere.radius, row(table, k, _X), n)
         w = s + c
         gap = w + excursion * table[k, _BETA] - u[i]
-        if gap <= 0.0:
+        if c == 0.0 or gap <= 0.0:
             continue
         u[i] += gap
         f = table[k, _GAIN] * gap
         patch.f[k] = f
         load += f
-        normal = add(normal, scale(f, n))
-        force = add(force, add(scale(f, n), scale(f / c, add(d, scale(s, n)))))
-        moment = subtract(moment, scale(f, add(d, scale(w, n))))  # the vertex is at X - w n
+        push = add_vertex(push, f, n, d, s, c, w)
     if load <= 0.0:
-        return False, Push(force, normal, moment)
-    return True, Push(force, normal, divide(moment, load))
+        return False, push
+    return True, Push(push.force, push.normal, divide(push.arm, load))
 
 
 @compiled
@@ -190,29 +178,24 @@ _MARGIN_M = 0.005
 """Motion of the sphere after which the vertices near it are searched again."""
 
 
-class WinklerTissue(TissueBackend):
+class WinklerTissue(SkinBody):
     """A soft surface pressed by a sphere. Raises UserError if the mesh is too fine for the period."""
 
     def __init__(
         self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3
     ) -> None:
-        stiffness = stiffness or Stiffness()
-        super().__init__(model, breathing, dt)
+        super().__init__(model, stiffness, breathing, dt)
+        stiffness = self._stiffness
         self.mechanics = assemble(model, stiffness)
         self.substeps = self.mechanics.substeps(dt)
-        self.friction = skin(stiffness.friction, model.background)
         n, h = len(model.vertices), dt / self.substeps
         self.displacement: Array = np.zeros(n)
         """u [m] along the inward rest normal, shape (n,)."""
         self.branches: Array = np.zeros((len(stiffness.prony_g), n))
         """y_k [m]: relaxed displacement, shape (b, n)."""
-        self.disturbed = False
-        """True once anything has moved; before, the field is kept exactly at rest."""
-        self._stiffness = stiffness
         self._prony_g = stiffness.prony_g
         self._wall = self._wall_of(stiffness, h)
         self._gain = self.mechanics.damping / h
-        self._excursion = 0.0
         self._free = np.flatnonzero(~model.fixed)
         self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._near: Near | None = None
@@ -254,12 +237,9 @@ class WinklerTissue(TissueBackend):
 
     def settle(self) -> None:
         """See `TissueBackend`."""
+        super().settle()
         self.displacement[:] = self.branches[:] = 0.0
-        self.friction.release()
-        self._excursion, self._previous_centre = 0.0, None
-        self._near, self._patch = None, self._no_patch
-        self.disturbed = self.touching = False
-        self.activation = 1.0
+        self._near, self._patch, self._previous_centre = None, self._no_patch, None
 
     def in_steps_of(self, dt: float) -> TissueBackend:
         """See `TissueBackend`. Implicit steps."""
@@ -279,11 +259,8 @@ class WinklerTissue(TissueBackend):
         """Run one explicit step; in contact sets `wrench` (6,) to force [N] and torque [N m] on the sphere."""
         self._wall.activation[0] = self.activation
         touching = step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
-        if touching:
-            self.disturbed = True
-        elif self.touching:
-            self.friction.release()
-        self.touching = touching
+        self.disturbed = self.disturbed or touching
+        self._set_touching(touching)
 
     def _gather(self, p: list[float], radius: float) -> None:
         """Find the vertices that a sphere near `p` [m] can touch."""
