@@ -23,7 +23,7 @@ from pydantic import TypeAdapter
 from palpate.environment import FIXED
 from palpate.run.group import Groups, one_per_process
 from palpate.run.options import Record
-from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
+from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes, secure_bus
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, TEST, measure
 from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
@@ -328,7 +328,7 @@ class FaultWatch:
 def serve() -> None:
     """Conduct the run of the command line; write the observations into its folder."""
     run = TypeAdapter(FaultRun).validate_json(sys.argv[1])
-    with SecureBus() if run.secure else nullcontext() as bus:
+    with secure_bus() if run.secure else nullcontext() as bus:
         _conduct(run, bus)
 
 

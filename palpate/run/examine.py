@@ -21,7 +21,7 @@ from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
 from palpate.run.places import Absent
-from palpate.run.processes import SecureBus
+from palpate.run.processes import secure_bus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.self_test import RATES, TEST, measure
@@ -121,7 +121,7 @@ def _run(
         return run_composed(scenario, folder, tell, observers)
     rate = _rate(scenario) if options.wallclock else 1.0
     timing = Timing(options.wallclock, 1.0 if options.realtime else None, rate=rate, handover_s=options.handover)
-    with SecureBus(options.keys) if options.secure else nullcontext() as bus:
+    with secure_bus(options.keys) if options.secure else nullcontext() as bus:
         return run_distributed(scenario, folder, tell, observers, timing, bus, absent, groups)
 
 

@@ -7,13 +7,12 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
-from typing import IO, Any, NamedTuple, Self
+from typing import IO, Any, NamedTuple
 
 from palpate.apart import describe_end
 from palpate.environment import FIXED, set_environment
@@ -27,24 +26,19 @@ from palpate_bus.security.access import ROUTER, access_control
 from palpate_bus.security.keys import init, read
 from palpate_bus.settings import BusConfigError, Settings, variable
 from palpate_bus.wire.rmw import make_key
-from palpate_bus.wire.zenoh_config import BusOptions, close_session, free_port, mesh, open_session
+from palpate_bus.wire.zenoh_config import BusOptions, free_port, mesh, session
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_inputs import read_yaml
 from palpate_models.scenario.load import view_of
 
 
-class SecureBus:
-    """A router for one run with mutual TLS, on which each role has the rights of its contract row; a context manager."""
+class SecureBus(NamedTuple):
+    """A router for one run with mutual TLS, on which each role has the rights of its contract row."""
 
-    def __init__(self, keys: Path | None = None) -> None:
-        """`keys`: a folder made by `palpate keys init`; by default keys are made for this run alone."""
-        self._own: RunFolder | None = None
-        if keys is None:  # if this process is killed, the next command removes the folder
-            self._own = RunFolder()
-            keys = self._own.path / "keys"
-        self.keys = keys.resolve()
-        self.endpoint = f"tls/127.0.0.1:{free_port()}"
+    keys: Path
+    """Folder of all certificates, absolute."""
+    endpoint: str
 
     def options(self, role: str) -> BusOptions:
         """Return the bus options of a role. Raises BusConfigError if its certificate is missing, expired or of another role."""
@@ -56,19 +50,24 @@ class SecureBus:
             raise BusConfigError(f"{certificate.path}: {found}; {wanted}")
         return options
 
-    def __enter__(self) -> Self:
-        """Start the router. Raises BusConfigError."""
-        with ExitStack() as stack:
-            if self._own is not None:
-                stack.callback(self._own.remove)
-                init(self.keys, days=2)
-            options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
-            stack.callback(close_session, open_session(options, access_control(contract())))
-            self._close = stack.pop_all().close
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._close()
+@contextmanager
+def secure_bus(keys: Path | None = None) -> Iterator[SecureBus]:
+    """Start a router for a `with` block. Raises BusConfigError.
+
+    `keys`: a folder made by `palpate keys init`; by default keys are made for this run alone.
+    """
+    with ExitStack() as stack:
+        if keys is None:
+            own = RunFolder()  # if this process is killed, the next command removes the folder
+            stack.callback(own.remove)
+            keys = own.path / "keys"
+            init(keys, days=2)
+        bus = SecureBus(keys.resolve(), f"tls/127.0.0.1:{free_port()}")
+        stack.enter_context(
+            session(BusOptions(mode="router", listen=(bus.endpoint,), tls=bus.keys / ROUTER), access_control(contract()))
+        )
+        yield bus
 
 
 COMPOSE = "docker-compose.yml"

@@ -79,18 +79,12 @@ class LockstepNode(Node):
     def _step(self, seat: Seat, t: int) -> None:
         self._acting = seat
         self._inputs[seat].await_tick(t, self._attend)
-        everything: list[Outgoing] = []
-        blame = seat.stepper.blame
-        for sent in seat.stepper.parts(t):
-            start = perf_counter_ns()
-            self._send(seat, sent)
-            blame.send += perf_counter_ns() - start
-            everything += sent
+        sent = self._step_and_send(seat, t)
         start = perf_counter_ns()
         if seat in self._advance_senders:
             self._advance_senders[seat].close(t)
-        seat.output.record(everything, t)
-        blame.send += perf_counter_ns() - start
+        seat.output.record(sent, t)
+        seat.stepper.blame.send += perf_counter_ns() - start
         seat.tick = t
 
     def _send(self, seat: Seat, sent: Sequence[Outgoing]) -> None:

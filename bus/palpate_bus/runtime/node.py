@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from time import perf_counter_ns
 from typing import Any
 
 from palpate_bus.messages import RunControl, ServiceReport
@@ -100,6 +101,16 @@ class Node(ABC):
             for seat in self._seats:
                 seat.fail(failure)
             raise
+
+    def _step_and_send(self, seat: Seat, t: int) -> list[Outgoing]:
+        """Step a service at `t` [ns]; send the messages of each part before the next is computed. Return all."""
+        everything: list[Outgoing] = []
+        for sent in seat.stepper.parts(t):
+            start = perf_counter_ns()
+            self._send(seat, sent)
+            seat.stepper.blame.send += perf_counter_ns() - start
+            everything += sent
+        return everything
 
     @abstractmethod
     def _join(self) -> None:

@@ -12,7 +12,7 @@ On a slow machine the common clock may run slower than the wall clock (PALPATE_R
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
-from time import monotonic_ns, perf_counter_ns, sleep
+from time import monotonic_ns, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -152,13 +152,7 @@ class WallClockNode(Node):
                     t += late // period * period
                     self._number["skips"] += 1
             self._receive(t)
-            everything: list[Outgoing] = []
-            for sent in self._stepper.parts(t):
-                start = perf_counter_ns()
-                self._send(self._seat, sent)
-                self._stepper.blame.send += perf_counter_ns() - start
-                everything += sent
-            self._seat.output.record(everything, t)
+            self._seat.output.record(self._step_and_send(self._seat, t), t)
             self._seat.tick = t
             while (message := self._link.poll()) is not None:
                 self._obey(message)
