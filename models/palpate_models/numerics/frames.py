@@ -14,6 +14,13 @@ Indices = NDArray[np.intp]
 Ints = NDArray[np.int64]
 
 
+def frozen(values: ArrayLike) -> Array:
+    """Return an array of the values that is never written to."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
 def rigid(R: ArrayLike, p: ArrayLike) -> Array:
     """Return the homogeneous matrix, shape (4, 4), of a rotation, shape (3, 3), and a translation, shape (3,)."""
     X = np.eye(4)

@@ -6,12 +6,12 @@ Marks of certainty: [V] read in the source (its abstract), [A] assumed.
 import math
 from bisect import bisect_right
 from typing import Annotated, Any, Literal
-from zlib import crc32
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generators
 from palpate_models.section import Ends, Positive, Section
 
 TABLE_S = 600.0
@@ -126,8 +126,7 @@ STILL = BreathingCurve(Breathing(kind="none"), 0)
 
 def _breaths(breathing: Breathing, seed: int) -> Array:
     """Return the table of breaths, shape (n, 5)."""
-    streams = np.random.SeedSequence([seed, crc32(b"breathing")]).spawn(2)
-    breaths, coughs = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+    breaths, coughs = generators(seed, "breathing", 2)
     rows: list[tuple[float, float, float, float, float]] = []
     z = breaths.standard_normal(3)
     share = (1 - breathing.pause) / (1 + breathing.expiration_ratio)

@@ -5,7 +5,7 @@ Kinematics, limits, masses and inertias: lbr_fri_ros2_stack, `iiwa7_description`
 
 import numpy as np
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import frozen
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 
 JOINT_NAMES = tuple(f"lbr_A{i}" for i in range(1, 8))
@@ -13,18 +13,13 @@ LINK_NAMES = (*(f"lbr_link_{i}" for i in range(8)), "lbr_link_ee")
 """The base, the link behind each joint, the flange."""
 
 
-def _freeze(values: Array) -> Array:
-    values.setflags(write=False)
-    return values
-
-
-POSITION_LIMIT = _freeze(np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]))
+POSITION_LIMIT = frozen(np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0]))
 """Joint positions lie within +- this [rad], shape (7,)."""
-VELOCITY_LIMIT = _freeze(np.deg2rad([98.0, 98.0, 100.0, 130.0, 140.0, 180.0, 180.0]))
+VELOCITY_LIMIT = frozen(np.deg2rad([98.0, 98.0, 100.0, 130.0, 140.0, 180.0, 180.0]))
 """Joint speed limits [rad/s], shape (7,)."""
-TORQUE_LIMIT = _freeze(np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0]))
+TORQUE_LIMIT = frozen([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0])
 """Joint torque limits [N m], shape (7,)."""
-HOME = _freeze(np.deg2rad([0.0, -25.0, 0.0, -105.0, 0.0, 100.0, 0.0]))
+HOME = frozen(np.deg2rad([0.0, -25.0, 0.0, -105.0, 0.0, 100.0, 0.0]))
 """Ready posture [rad], shape (7,): folded back over the base, tool straight down, the arm out of the camera's view."""
 
 JOINT_ORIGIN = (
@@ -69,16 +64,16 @@ ARM = Arm(
     name="lbr",
     joint_names=JOINT_NAMES,
     link_names=LINK_NAMES,
-    origin_m=_freeze(np.array(JOINT_ORIGIN)),
-    axis=_freeze(np.array(JOINT_AXIS, dtype=float)),
-    flange_m=_freeze(np.array((0.0, 0.0, LINK_7_TO_FLANGE_M))),
-    lower_rad=_freeze(-POSITION_LIMIT),
+    origin_m=frozen(JOINT_ORIGIN),
+    axis=frozen(JOINT_AXIS),
+    flange_m=frozen((0.0, 0.0, LINK_7_TO_FLANGE_M)),
+    lower_rad=frozen(-POSITION_LIMIT),
     upper_rad=POSITION_LIMIT,
     velocity_radps=VELOCITY_LIMIT,
     torque_nm=TORQUE_LIMIT,
-    acceleration_radps2=_freeze(np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])),
-    stiffness_nmprad=_freeze(np.array([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])),
-    hold_damping_nms=_freeze(np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])),
+    acceleration_radps2=frozen([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0]),
+    stiffness_nmprad=frozen([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0]),
+    hold_damping_nms=frozen([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0]),
     home_rad=HOME,
     inertias=ARM_INERTIA,
     capsules=_ARM_CAPSULES,

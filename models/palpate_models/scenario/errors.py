@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from typing import Annotated, Any, Final, Literal, NamedTuple
-from zlib import crc32
 
 import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
 from palpate_models.numerics.frames import Array, matrix
+from palpate_models.numerics.seeds import generators
 from palpate_models.section import NonNegative, Pose, Positive, Section
 
 Level = Literal["none", "typical", "poor"]
@@ -290,8 +290,7 @@ class DrawnErrors(NamedTuple):
 
 def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
     """Draw the equipment of the patient with this seed; `joints`: number of the arm's. Fields are drawn independently."""
-    streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(6)
-    force, camera, hand_eye, registration, arm, torque = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+    force, camera, hand_eye, registration, arm, torque = generators(seed, "errors", 6)
     drawn = draw_arm(errors.arm, arm, joints)
     if any(errors.chosen.indenter_m):  # the last joint turns about the tool's axis
         drawn.origin_m[-1, :2] += errors.chosen.indenter_m

@@ -7,25 +7,18 @@ import numpy as np
 import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_models.numerics.frames import Array
-
-
-def _freeze(values: list[float]) -> Array:
-    array = np.array(values)
-    array.setflags(write=False)
-    return array
-
+from palpate_models.numerics.frames import Array, frozen
 
 NORMAL_STIFFNESS = 5000.0
 """K_z [N/m] along the tool: the depth error is 0.4 to 1.5 mm even before regulation."""
-CARTESIAN_STIFFNESS = _freeze([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
+CARTESIAN_STIFFNESS = frozen([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
 """[N/m, N m/rad] in axes of the indenter: stiff along the tool, softer across it, softest in spin."""
-DAMPING_RATIO = _freeze([0.8] * 6)
+DAMPING_RATIO = frozen([0.8] * 6)
 POSTURE_STIFFNESS = 20.0
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
-_NO_TWIST = _freeze([0.0] * 6)
-_NO_WRENCH = _freeze([0.0] * 6)
-_NO_JOINTS = _freeze([])
+_NO_TWIST = frozen([0.0] * 6)
+_NO_WRENCH = frozen([0.0] * 6)
+_NO_JOINTS = frozen([])
 AT_REST = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,

@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, frozen
 from palpate_models.robot.chain import Arm
 
 
@@ -64,8 +64,7 @@ class Driver:
     def __init__(self, arm: Arm, force_emergency_n: float, *, positions: bool = False) -> None:
         """`force_emergency_n`: force at the tool [N] above which the driver holds; `positions`: commands are positions."""
         self._arm, self._positions = arm, positions
-        self._still = np.zeros(arm.joints)
-        self._still.setflags(write=False)
+        self._still = frozen(np.zeros(arm.joints))
         self._force_emergency = self._force_limit = force_emergency_n
         self.mode = DriverMode.IDLE
         self.cause = HoldCause.NONE

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
-from zlib import crc32
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from palpate_bus.messages.codes import DriverMode, HoldCause
 from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.numerics.seeds import generators
 from palpate_models.robot.arm import arm_of, link_names, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
@@ -39,8 +39,7 @@ class RobotService(Service):
         """Start at rest at home. `plant` creates the physics."""
         robot, arm = known.robot, arm_of(known.robot)
         drawn = draw_errors(known.errors, known.seed, arm.joints)
-        streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(3)
-        joint_rng, ft_rng, torque_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+        joint_rng, ft_rng, torque_rng = generators(known.seed, "robot", 3)
         self._robot, self._names, self._links = robot, list(arm.joint_names), link_names(robot)
         self._plant = plant(robot, drawn=drawn.arm)
         self._sensor = FtSensor(drawn.force, ft_rng, DT)
