@@ -22,7 +22,7 @@ from time import monotonic, sleep
 from types import FrameType
 from typing import Any, Final, NoReturn, TypeVar, cast
 
-from palpate_errors import RunError, UserError
+from palpate_errors import RunError, UserError, restate
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -101,10 +101,8 @@ def run_guarded(
 
     `limit_s`: how long it may stay at one `place`.
     """
-    try:
+    with restate(ChildLost, error, part):
         return run_apart(lambda _: work(), check=TimeLimit(place, lambda: limit_s).check)
-    except ChildLost as lost:
-        raise error(f"{part}: {lost}") from None
 
 
 class _Child:

@@ -5,6 +5,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -16,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from palpate_errors import ExitStatus, RunError, UserError
+from palpate_errors import ExitStatus, RunError, UserError, restate
 from palpate_inputs import printable
 
 
@@ -103,34 +104,28 @@ def fail(text: object) -> NoReturn:
     raise typer.Exit(ExitStatus.FAILED) from None
 
 
-def output_file(text: str, *names: str) -> typer.models.OptionInfo:
+def output_file(text: str, *names: str, folder: bool = False) -> typer.models.OptionInfo:
     """Return the option for a file that the command writes at its end; its folder is made when the options are read.
 
-    `text`: the help; `names`: names of the option, if not that of its parameter.
+    `text`: the help; `names`: names of the option, if not that of its parameter; `folder`: it is a folder.
     """
-    return _output(text, names, folder=False)
 
-
-def output_folder(text: str, *names: str) -> typer.models.OptionInfo:
-    """Return the option for a folder that the command writes into; as `output_file`."""
-    return _output(text, names, folder=True)
-
-
-def _output(text: str, names: tuple[str, ...], folder: bool) -> typer.models.OptionInfo:
     def check(path: Path | None) -> Path | None:
         if path is None:
             return None
         made = path if folder else path.parent
-        try:
+        with restate(OSError, typer.BadParameter, f"{made}: cannot be made a folder"):
             made.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise typer.BadParameter(f"{made}: cannot be made a folder: {error.strerror}") from None
         if (path.is_dir() and not folder) or not os.access(path if path.exists() else made, os.W_OK):
             raise typer.BadParameter(f"{path}: is not a writable {'folder' if folder else 'file'}")
         return path
 
     option: typer.models.OptionInfo = typer.Option(*names, help=text, callback=check)
     return option
+
+
+output_folder = partial(output_file, folder=True)
+"""The option for a folder that the command writes into."""
 
 
 def wide_console(min_width: int = 0) -> Console:

@@ -3,6 +3,8 @@
 Imports no other package of Palpate, so every package may use it.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 
 
@@ -29,3 +31,20 @@ class UserError(PalpateError, ValueError):
 
 class RunError(PalpateError, RuntimeError):
     """A run or a part of it failed after it started. The command reports what was measured and exits with status 3."""
+
+
+@contextmanager
+def restate(
+    cause: type[Exception] | tuple[type[Exception], ...],
+    error: type[Exception],
+    name: object,
+    but: type[Exception] | tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """Raise `error` in place of a `cause` in a `with` block. Its text is `name`, then that of the cause. Those of `but` pass."""
+    try:
+        yield
+    except but:
+        raise
+    except cause as problem:
+        reason = problem.strerror if isinstance(problem, OSError) and problem.strerror else problem
+        raise error(f"{name}: {reason}") from problem

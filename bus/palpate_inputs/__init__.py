@@ -16,7 +16,7 @@ from zipfile import ZipFile
 
 import yaml
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 
 VARIABLE = "PALPATE_BOUNDS"
 KB, MB = 1 << 10, 1 << 20
@@ -70,10 +70,8 @@ class Bounds(NamedTuple):
 @cache
 def bounds() -> Bounds:
     """Return the bounds of this process. Raises InputError for an invalid PALPATE_BOUNDS."""
-    try:
+    with restate(ValueError, InputError, VARIABLE):
         return Bounds.parse(os.environ.get(VARIABLE, ""))
-    except ValueError as error:
-        raise InputError(f"{VARIABLE}: {error}") from None
 
 
 def over(name: object, what: str, allowed: str, error: type[UserError] = InputError) -> UserError:
@@ -123,17 +121,15 @@ def read_yaml(path: Path, error: type[UserError] = InputError) -> Any:
     return parse_yaml(read_text(path, error, bounds().text_kb * KB), str(path), error)
 
 
-def read_json(path: Path, error: type[UserError] = InputError) -> Any:
-    """Return the content of a JSON file as Python values. Raises `error`, OSError."""
-    return parse_json(read_text(path, error), str(path), error)
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file as Python values. Raises InputError, OSError."""
+    return parse_json(read_text(path), str(path))
 
 
 def parse_json(text: str | bytes, name: str, error: type[UserError] = InputError) -> Any:
     """Return JSON as Python values. Raises `error` that names its source `name`."""
-    try:
+    with restate((ValueError, RecursionError), error, f"{name}: not JSON"):
         return json.loads(text)
-    except (ValueError, RecursionError) as problem:
-        raise error(f"{name}: not JSON: {problem}") from problem
 
 
 class _RefusedError(ValueError):
@@ -234,10 +230,8 @@ def check_xml(content: _TextT, name: object, error: type[UserError] = InputError
         depth -= 1
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = refuse, begin, end
-    try:
+    with restate(expat.ExpatError, error, f"{name}: not XML"):
         parser.Parse(content, True)
-    except expat.ExpatError as problem:
-        raise error(f"{name}: not XML: {problem}") from problem
     return content
 
 
@@ -264,16 +258,14 @@ def read_arrays(file: Path | bytes, name: object, error: type[UserError] = Input
     """Return the arrays of an npz file or of its content. Raises `error`."""
     import numpy as np  # noqa: PLC0415 - most readers need no arrays
 
-    try:
-        with io.BytesIO(file) if isinstance(file, bytes) else InputFile(file, error) as stream:
+    # damaged archives and headers raise many kinds, MemoryError for a shape without data
+    with restate(Exception, error, f"{name}: not an npz file", but=UserError):
+        stream = io.BytesIO(file) if isinstance(file, bytes) else InputFile(file, error)
+        with stream:
             check_archive(ZipFile(stream), name, error)
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as stored:
                 return {key: stored[key] for key in stored.files}
-    except UserError:
-        raise
-    except Exception as problem:  # damaged archives and headers raise many kinds, MemoryError for a shape without data
-        raise error(f"{name}: not an npz file: {problem}") from problem
 
 
 def printable(text: str) -> str:

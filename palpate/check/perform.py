@@ -30,8 +30,9 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch, gid
 from palpate_bus.wire.rmw import AttachmentWriter, topic_key
-from palpate_bus.wire.transport import Transport
+from palpate_bus.wire.transport import ReceivedSample, Subscription, Transport
 from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_errors import restate
 from palpate_inputs import parse_json
 from palpate_models.scenario.load import dump_scenario, view_of
 
@@ -180,14 +181,8 @@ class LiveRig(Rig):
         self.equal("garbage on its inputs does not stop it", got, "continues")
 
     def _receive_reports(self) -> list[Any]:
-        received = []
-        while (sample := self._reports.get(0)) is not None:
-            try:
-                message = codec.decode(sample.payload, REPORT_TYPE)
-            except codec.CodecError as error:
-                self.undecodable.append(f"palpate/report: {error}")
-                continue
-            received.append(message)
+        received = [message for _, message in self._decoded(self._reports, REPORT_TYPE, "palpate/report")]
+        for message in received:
             if message.state == ServiceReport.FINISHED:
                 self.finished = True
                 self.facts = parse_json(message.detail or "{}", "the detail of palpate/report")
@@ -237,14 +232,18 @@ class LiveRig(Rig):
 
     def _drain(self) -> None:
         for name, reader in self._readers.items():
-            kind = self.contract.topics[name].type
-            while (received := reader.get(0)) is not None:
-                try:
-                    message = codec.decode(received.payload, kind)
-                except codec.CodecError as error:
-                    self.undecodable.append(f"{name}: {error}")
-                    continue
+            for received, message in self._decoded(reader, self.contract.topics[name].type, name):
                 self.log[name].append(ReceivedMessage(self.t, message, received.sequence, received.sent))
+
+    def _decoded(self, reader: Subscription, kind: str, name: str) -> Iterator[tuple[ReceivedSample, Message]]:
+        """Yield what a subscription has received, and its messages; note what cannot be decoded."""
+        while (received := reader.get(0)) is not None:
+            try:
+                message = codec.decode(received.payload, kind)
+            except codec.CodecError as error:
+                self.undecodable.append(f"{name}: {error}")
+                continue
+            yield received, message
 
 
 @contextmanager
@@ -262,10 +261,8 @@ def start_implementation(command: str | None, role: str, settings: RigSettings, 
             "PALPATE_OUT": folder, "PALPATE_RECORD": "none", "ROS_DOMAIN_ID": str(domain),
         }  # fmt: skip
         split = shlex.split(command)
-        try:
+        with restate(OSError, NoBusError, f"--start {command}"):
             child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
-        except OSError as error:
-            raise NoBusError(f"--start {command}: {error}") from error
         try:
             yield
             with suppress(subprocess.TimeoutExpired):

@@ -24,6 +24,7 @@ from palpate_bus.runs.announcement import NoBusError
 from palpate_bus.wire.liveliness import Entity, EntityKind
 from palpate_bus.wire.rmw import parse_key, topic_key
 from palpate_bus.wire.transport import ReceivedSample, Subscription
+from palpate_errors import restate
 
 
 class TopicTimes(NamedTuple):
@@ -213,10 +214,8 @@ def _subscribe(name: str, connect: list[str] | None, run: str | None, domain: in
             if not live:
                 raise _unknown(name)
             kind = min(live)
-            try:
+            with restate(codec.CodecError, NoBusError, f"topic {name}"):
                 codec.message_type(kind)
-            except codec.CodecError as error:
-                raise NoBusError(f"topic {name}: {error}") from error
             row = Topic(name=name, type=kind, producer="", readers={}, qos="event", event=True, doc="")
         with closing(every_sender(bus.session, row, bus.target.domain)) as reader:
             yield row, reader
@@ -249,10 +248,8 @@ def _each_period(reader: Subscription, seconds: float | None) -> Iterator[list[R
 
 
 def _message(received: ReceivedSample, topic: Topic) -> Any:
-    try:
+    with restate(codec.CodecError, NoBusError, f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}"):
         return codec.decode(received.payload, topic.type)
-    except codec.CodecError as error:
-        raise NoBusError(f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}: {error}") from error
 
 
 def _stamp_ns(received: ReceivedSample, topic: Topic) -> int | None:

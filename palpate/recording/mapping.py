@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import parse_yaml, read_text
 from palpate_models.scenario.load import explain
 from palpate_models.section import Pose, Section, Vec3
@@ -157,10 +157,8 @@ class Mapping(Section):
 
 def read_mapping(path: Path) -> Mapping:
     """Return the mapping of a YAML file, with its paths as seen from here. Raises MappingError."""
-    try:
+    with restate(OSError, MappingError, path):
         text = read_text(path, MappingError)
-    except OSError as error:
-        raise MappingError(f"{path}: {error.strerror}") from None
     try:
         mapping = Mapping.model_validate(parse_yaml(text, str(path), MappingError))
     except ValidationError as error:

@@ -19,7 +19,7 @@ from palpate.recording.mapping import SCALES, Joints, MappedColumns, Mapping, To
 from palpate_bus.messages import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import KB, MB, InputFile, bounds, check_xml, over, read_bytes, read_text
 from palpate_models.numerics.frames import Array, Mask
 from palpate_plugins import needs
@@ -297,11 +297,9 @@ def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -
     """Return the poses of a frame of an arm by its joint positions."""
     import pinocchio  # noqa: PLC0415 - only for joint positions
 
-    try:
+    with restate(ValueError, ReadingError, f"{source.urdf}: is not a URDF"):
         text = read_text(source.urdf, ReadingError, bounds().text_kb * KB)
         model = pinocchio.buildModelFromXML(check_xml(text, source.urdf))
-    except ValueError as error:
-        raise ReadingError(f"{source.urdf}: is not a URDF: {error}") from None
     data, frame = model.createData(), model.getFrameId(source.frame)
     names = {name for _, state in states for name in state.name}
     if frame >= model.nframes or (unknown := sorted(name for name in names if not model.existJointName(name))):

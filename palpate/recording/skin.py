@@ -11,7 +11,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from threadpoolctl import threadpool_limits
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.patient.mesh import vertex_normals
 from palpate_models.patient.mesh_file import read_mesh
@@ -63,10 +63,8 @@ class RecordedSkin(NamedTuple):
 
 def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> RecordedSkin:
     """Return the skin of a mesh in the frame of the positions, in units of `scale` [m]. Raises UserError."""
-    try:
+    with restate(UserError, UserError, f"body.surface = {file}"):
         vertices, triangles = read_mesh(file)
-    except UserError as error:
-        raise UserError(f"body.surface = {file}: {error}") from None
     centres = apply(X_AW, scale * vertices)
     centres += radius * vertex_normals(centres, triangles)
     xy = np.stack(np.meshgrid(*stations, indexing="ij"), axis=-1)

@@ -29,7 +29,7 @@ from palpate_bus.runs.announcement import live_runs
 from palpate_bus.runs.run_folder import in_use
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import InputFile, read_arrays, read_json
 from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -253,18 +253,14 @@ def read_interrupted(folder: Path) -> InterruptedRun:
 
     Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
     """
-    try:
+    with restate(OSError, EvidenceError, f"{folder}: cannot be read"):
         if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live_runs()):
             raise EvidenceError(f"{folder}: its run is still active; stop it first")
-    except OSError as error:
-        raise EvidenceError(f"{folder}: cannot be read: {error}") from error
-    try:
+    with restate((RecordingError, ScenarioError), EvidenceError, f"{folder}: nothing can be recovered"):
         scenario = load_scenario(str(folder / "scenario.yaml"))
         recording = _recording(folder)
         collected = _read_collected(recording) if recording.path.name == FILE else collect(recording)
         return InterruptedRun(folder, scenario, recording, collected)
-    except (RecordingError, ScenarioError) as error:
-        raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
 
 
 def _recording(run: Path) -> Recording:
@@ -277,7 +273,5 @@ def _recording(run: Path) -> Recording:
         raise NothingRecordedError(f"{run}: nothing can be recovered: it has no recording and no {FILE}")
     while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < _STILL_S:
         sleep(0.1)  # the recorder outlives the conductor by some seconds
-    try:
+    with restate((OSError, ValueError), NothingRecordedError, f"{folder}: nothing can be recovered"):
         return salvage(folder, [topic.name for role in (CONDUCTOR, "assessment") for topic, _ in contract().inputs(role)])
-    except (OSError, ValueError) as error:
-        raise NothingRecordedError(f"{folder}: nothing can be recovered: {error}") from error

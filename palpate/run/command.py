@@ -76,15 +76,13 @@ def prepare(
     from palpate.run.folder import set_aside
     from palpate.run.inputs import check_usable
     from palpate.run.roles import write_scenario_files
-    from palpate_errors import UserError
+    from palpate_errors import UserError, restate
 
     chosen = check_usable(scenario, settings, seed, elsewhere=True)
-    try:
+    with restate(OSError, UserError, f"--out {out}: cannot be written into"):
         if (earlier := set_aside(out)) is not None:
             say(f"the results of the earlier run were moved to {earlier}")
         write_scenario_files(chosen, out)
-    except OSError as error:
-        raise UserError(f"--out {out}: cannot be written into: {error.strerror}") from error
 
 
 def conduct(

@@ -18,7 +18,7 @@ from palpate.run.options import Record
 from palpate_bus.runs.run_folder import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunProgress, Tell
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import read_json
 from palpate_models.scenario.schema import Exam
 
@@ -71,10 +71,8 @@ def results_folder(path: Path, *, overwrite: bool = False, begun: Callable[[], b
     bring_back(path)
     earlier = _move_away(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
     try:
-        try:
+        with restate(OSError, UserError, f"--out {path}: cannot be made a folder"):
             path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
         with lock_output(path):
             if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
                 what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
@@ -100,21 +98,16 @@ def _move_away(path: Path) -> Path:
     if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
         raise UserError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with lock_output(path):
-        try:
-            return path.rename(aside)
-        except OSError as error:
-            raise UserError(f"--out {path} --overwrite: cannot be moved: {error.strerror}") from None
+    with lock_output(path), restate(OSError, UserError, f"--out {path} --overwrite: cannot be moved"):
+        return path.rename(aside)
 
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
     """Lock a results folder or file. A killed run leaves the file of the lock. Raises UserError if another run holds it."""
     lock = out / LOCK if out.is_dir() else out.with_name(f".{out.name}.lock")
-    try:
+    with restate(OSError, UserError, f"--out {out}: cannot be written into"):
         file = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise UserError(f"--out {out}: cannot be written into: {error.strerror}") from None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

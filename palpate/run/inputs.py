@@ -11,7 +11,7 @@ from palpate.apart import run_guarded
 from palpate.run.roles import NONE, check_choices, settings_of
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.settings import Settings
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
@@ -130,10 +130,8 @@ def check_usable(
     `services`: choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines, and they and the
     arm are not checked here.
     """
-    try:
+    with restate(MeshError, UserError, name):
         return check_examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
-    except MeshError as error:
-        raise UserError(f"{name}: {error}") from error
 
 
 def check_examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:

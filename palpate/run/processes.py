@@ -28,7 +28,7 @@ from palpate_bus.settings import BusConfigError, Settings, variable
 from palpate_bus.wire.rmw import make_key
 from palpate_bus.wire.zenoh_config import BusOptions, free_port, mesh, session
 from palpate_conductor.outcome import Timing
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import read_yaml
 from palpate_models.scenario.load import view_of
 
@@ -125,10 +125,8 @@ def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path]
 
 
 def _services(path: Path) -> dict[str, Any]:
-    try:
+    with restate(OSError, UserError, f"{path}: cannot be read"):
         document = read_yaml(path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error}") from error
     return _mapping(document.get("services") if isinstance(document, dict) else document, f"{path}: services")
 
 

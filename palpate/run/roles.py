@@ -10,6 +10,7 @@ from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.runs.run_folder import name_run
 from palpate_bus.settings import Settings
+from palpate_errors import restate
 from palpate_models.scenario.load import HIDDEN, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services
 from palpate_models.section import did_you_mean
@@ -74,12 +75,10 @@ def check_choices(scenario: Scenario) -> Scenario:
     for role, name in services.items():
         if (role, name) == ("tissue", NONE) or (name == "default" and _ROLES[role].optional and role not in workers(scenario)):
             continue
-        try:
+        with restate(PluginError, PluginError, scenario.name):
             implementations.kind(role).check(name)
             if role not in OBSERVERS:  # a run without the dashboard's libraries has no dashboard
                 implementations.kind(role).check_libraries(name)
-        except PluginError as error:
-            raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(name):
             services[role] = str(Path(name).resolve())
     _check_fmu(scenario)
@@ -87,10 +86,8 @@ def check_choices(scenario: Scenario) -> Scenario:
         implementations.create("camera", "replay", scenario)
     search = scenario.search
     if scenario.exam.searched:
-        try:
+        with restate(PluginError, PluginError, scenario.name):
             _check_policy(scenario)
-        except PluginError as error:
-            raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(search.policy):
             search = search.model_copy(update={"policy": str(Path(search.policy).resolve())})
     return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
@@ -124,11 +121,8 @@ def _check_fmu(scenario: Scenario) -> None:
     if given := scenario.tissue.fmu:
         from palpate_fmu.reading import FmuError, open_fmu  # noqa: PLC0415 - images of other roles lack its libraries
 
-        try:
-            with open_fmu(Path(given)):
-                pass
-        except FmuError as error:
-            raise PluginError(f"{scenario.name}: tissue.fmu = {given!r}: {error}") from error
+        with restate(FmuError, PluginError, f"{scenario.name}: tissue.fmu = {given!r}"), open_fmu(Path(given)):
+            pass
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:

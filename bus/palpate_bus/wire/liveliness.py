@@ -22,6 +22,7 @@ import zenoh
 
 from palpate_bus.contract import Qos, Topic
 from palpate_bus.wire.rmw import GID_SIZE, WireError, dds_type, ros_type
+from palpate_errors import restate
 
 ADMIN_SPACE = "@ros2_lv"
 _DEFAULT_DEPTH = 42  # RMW_ZENOH_DEFAULT_HISTORY_DEPTH
@@ -99,11 +100,9 @@ def parse_token(key: str) -> Entity:
     if len(parts) < _PARTS_OF_NODE or parts[0] != ADMIN_SPACE or not all(parts):
         raise WireError(f"not a liveliness token: {key!r}")
     _, domain, zid, node_id, entity_id, kind, enclave, namespace, node, *endpoint = parts
-    try:
+    with restate(ValueError, WireError, f"liveliness token {key!r}"):
         entity_kind = EntityKind(kind)
         numbers = int(domain), int(node_id), int(entity_id)
-    except ValueError as error:
-        raise WireError(f"liveliness token {key!r}: {error}") from error
     described = None
     if entity_kind is not EntityKind.NODE:
         if len(parts) < _PARTS_OF_ENDPOINT:

@@ -37,7 +37,7 @@ from typing import NamedTuple
 from palpate_bus.contract import Topic
 from palpate_bus.messages.codec import type_hash
 from palpate_bus.settings import BusConfigError
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 
 TAG_SIZE = 8
 """Bytes; one guess in 1.8e19 is right."""
@@ -75,10 +75,8 @@ def read_key(file: Path | None) -> bytes | None:
     """Return the key in a file; None without a file. Raises BusConfigError if it is invalid or readable to others."""
     if file is None:
         return None
-    try:
+    with restate(OSError, BusConfigError, f"PALPATE_KEY is {file}: cannot be read"):
         key, mode = file.read_bytes(), file.stat().st_mode
-    except OSError as error:
-        raise BusConfigError(f"PALPATE_KEY is {file}: cannot be read: {error.strerror}") from None
     if mode & 0o077:
         raise BusConfigError(f"PALPATE_KEY is {file}: others may read it (mode {mode & 0o777:04o}); allowed is 0600")
     if len(key) != KEY_SIZE:

@@ -49,6 +49,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.settings import BusConfigError, Settings, variable
+from palpate_errors import restate
 
 UNIX_PATH_MAX_BYTES = 107  # sun_path without its NUL on Linux
 
@@ -136,10 +137,8 @@ def _check_endpoint(endpoint: str) -> None:
 def zenoh_config(options: BusOptions) -> zenoh.Config:
     """Return zenoh's configuration for these options. Raises BusConfigError if the configuration file cannot be used."""
     if options.zenoh_config is not None:
-        try:
+        with restate(zenoh.ZError, BusConfigError, f"PALPATE_ZENOH_CONFIG is {options.zenoh_config}"):
             return zenoh.Config.from_file(options.zenoh_config)
-        except zenoh.ZError as error:
-            raise BusConfigError(f"PALPATE_ZENOH_CONFIG is {options.zenoh_config}: {error}") from error
     config = zenoh.Config()
     for key, value in _zenoh_settings(options).items():
         config.insert_json5(key, json.dumps(value))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_errors import restate
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.reading import FmuError, read_description
 from palpate_models.numerics.frames import Array
@@ -19,16 +20,12 @@ def run_and_plot(file: Path, out: Path) -> tuple[str, ...]:
     import fmpy  # noqa: PLC0415  (slow to import)
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    try:
+    with restate(Exception, FmuError, file, but=FmuError):
         description, _ = read_description(file)
         names = tuple(v.name for v in description.modelVariables if v.causality == "output" and not v.dimensions)
         if not names:
             raise FmuError(f"{file}: no scalar output to plot")
         result = fmpy.simulate_fmu(str(file), output=list(names), validate=False)
-    except FmuError:
-        raise
-    except Exception as error:
-        raise FmuError(f"{file}: {error}") from error
     for name in names:
         if not np.isfinite(result[name]).all():
             k = int(np.flatnonzero(~np.isfinite(result[name]))[0])

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import MB, InputFile, bounds, brief, check_archive, check_xml, over
 
 DESCRIPTION = "modelDescription.xml"
@@ -95,15 +95,11 @@ def open_fmu(path: Path) -> Iterator[zipfile.ZipFile]:
     if not path.is_file():
         raise FmuError(f"{path}: no such file")
     with ExitStack() as stack:
-        try:
+        with restate(Exception, FmuError, f"{path}: not an FMU", but=FmuError):  # a damaged archive raises many kinds
             file = stack.enter_context(InputFile(path, FmuError, bounds().document_mb * MB))
             archive = check_archive(stack.enter_context(zipfile.ZipFile(file)), path, FmuError)
             if DESCRIPTION not in archive.namelist():
                 raise FmuError(f"{path}: not an FMU: it has no {DESCRIPTION}")
-        except FmuError:
-            raise
-        except Exception as error:  # a damaged archive raises many kinds
-            raise FmuError(f"{path}: not an FMU: {error}") from error
         yield archive
 
 
@@ -180,14 +176,13 @@ def read_scalars(description: Any) -> dict[str, FmuVariable]:
     by_reference = {v.valueReference: v for v in description.modelVariables}
     found = {}
     for v in description.modelVariables:
-        try:
+        name = f"variable {brief(v.name)}"
+        with restate((KeyError, TypeError, ValueError), FmuError, f"{name}: the size of a dimension is not a number"):
             extents = [int(by_reference[d.valueReference].start if d.start is None else d.start) for d in v.dimensions or ()]
-        except (KeyError, TypeError, ValueError) as error:
-            raise FmuError(f"variable {brief(v.name)}: the size of a dimension is not a number: {error}") from error
         if not 0 <= prod(extents) <= bounds().elements or min(extents, default=0) < 0:
-            raise over(f"variable {brief(v.name)}", f"dimensions {brief(extents)}", "elements", FmuError)
+            raise over(name, f"dimensions {brief(extents)}", "elements", FmuError)
         if len(v.name) > NAME_CHARACTERS:
-            raise FmuError(f"variable {brief(v.name)}: a name of {len(v.name)} characters; allowed are {NAME_CHARACTERS}")
+            raise FmuError(f"{name}: a name of {len(v.name)} characters; allowed are {NAME_CHARACTERS}")
         unit = v.unit or (v.declaredType.unit if v.declaredType else None)
         rest = (v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
         found[v.name] = FmuVariable(v.name, (v.valueReference,), tuple(extents), *rest)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import Delaunay
 
+from palpate_errors import restate
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.abdomen import Shape, lattice, rings
 from palpate_models.patient.mesh import boundary_vertices, orient, vertex_normals
@@ -90,10 +91,8 @@ _LIMITS = {
 
 def read_grid(path: Path) -> BodyGrid:
     """Return the grid of a file. Raises GridError."""
-    try:
+    with restate((OSError, ValueError), GridError, f"phantom.grid = {path}: cannot be read as CSV"):
         table = np.genfromtxt(path, delimiter=",", names=True, encoding="utf-8", ndmin=1)
-    except (OSError, ValueError) as error:
-        raise GridError(f"phantom.grid = {path}: cannot be read as CSV: {error}") from error
     if sorted(table.dtype.names or ()) != sorted(columns):
         raise GridError(f"phantom.grid = {path}: has columns {', '.join(table.dtype.names or ())}; expected {', '.join(columns)}")
     for name, (low, high) in _LIMITS.items():

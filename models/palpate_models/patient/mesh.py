@@ -7,6 +7,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from palpate_errors import restate
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.mesh_file import IntArray, MeshError, read_mesh
 
@@ -47,7 +48,7 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
     Raises MeshError if the file cannot be read whole, or its surface is empty, not in metres, not at the origin, not facing
     the camera, degenerate, non-manifold, in several pieces, not orientable or too fine.
     """
-    try:
+    with restate(MeshError, MeshError, f"phantom.mesh = {path}"):
         vertices, triangles = weld(*read_mesh(path))
         check(vertices, triangles)
         triangles = orient(vertices, triangles)
@@ -58,8 +59,6 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
                 f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {LIMITS.max_vertices} are "
                 "simulated: decimate the mesh or raise phantom.edge_m"
             )
-    except MeshError as error:
-        raise MeshError(f"phantom.mesh = {path}: {error}") from error.__cause__
     return surface
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import bounds, over, read_bytes
 from palpate_models.numerics.frames import Array
 
@@ -44,7 +44,7 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     if not path.is_file():
         raise MeshError("no such file")
     content = read_bytes(path, MeshError)
-    try:
+    with restate(Exception, MeshError, f"cannot be read as {path.suffix.lower()}, it is damaged or not whole", but=MeshError):
         if path.suffix.lower() == ".stl":
             # One of text; a binary one has zeros, and its header may begin with `solid` too.
             as_text = content[:5].lower() == b"solid" and b"facet" in content[:1000].lower() and b"\0" not in content[:1000]
@@ -61,10 +61,6 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
         _check_ply(loaded)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         triangles = np.array(loaded.faces, dtype=np.int32).reshape(-1, 3)
-    except MeshError:
-        raise
-    except Exception as error:
-        raise MeshError(f"cannot be read as {path.suffix.lower()}, it is damaged or not whole: {error}") from error
     _check_counts(len(vertices), len(triangles))
     wrong = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
     if len(wrong):

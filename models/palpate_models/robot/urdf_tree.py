@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array, rigid
 
@@ -16,13 +16,11 @@ class UrdfTree:
     """A URDF file. Raises UserError if it is not one."""
 
     def __init__(self, path: Path) -> None:
-        try:
+        with restate((OSError, ElementTree.ParseError), UserError, f"{path}: not a URDF"):
             text = read_text(path)
             if "<!ENTITY" in text:
                 raise UserError(f"{path}: has XML entities, which may name other files: write their text")
             root = ElementTree.fromstring(text)
-        except (OSError, ElementTree.ParseError) as error:
-            raise UserError(f"{path}: not a URDF: {error}") from error
         if any("xacro" in element.tag for element in root.iter()):
             raise UserError(f"{path}: not a URDF: has xacro elements; expand it with the tool xacro")
         if root.tag != "robot":

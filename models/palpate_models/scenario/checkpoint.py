@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import read_arrays
 from palpate_models.numerics.frames import Array, Ints, Mask
 
@@ -74,7 +74,7 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
     if path is None:
         return None
     held = dict(read_arrays(path, path, CheckpointError))
-    try:
+    with restate((ValueError, KeyError, TypeError), CheckpointError, f"{path}: not a checkpoint of this version"):
         left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
         rows = len(held["time"])
         wanted: dict[str, tuple[int, ...]] = {
@@ -85,5 +85,3 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
             if array.shape != wanted[name] or array.dtype.kind not in "bif" or not np.isfinite(array).all():
                 raise ValueError(f"{name}: expected finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
         return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path}: not a checkpoint of this version: {error}") from error

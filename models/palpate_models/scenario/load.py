@@ -12,7 +12,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_inputs import brief, parse_yaml, read_text
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
@@ -143,10 +143,8 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
 
 def as_settings(fields: Mapping[str, Any]) -> list[str]:
     """Return fields by path as overrides `a.b=c` for `load_scenario`. Raises ScenarioError for values that YAML cannot hold."""
-    try:
+    with restate((TypeError, ValueError), ScenarioError, f"{', '.join(fields)}: expected numbers, words, lists and mappings"):
         return [f"{path}={json.dumps(value)}" for path, value in fields.items()]
-    except (TypeError, ValueError) as error:
-        raise ScenarioError(f"{', '.join(fields)}: expected numbers, words, lists and mappings: {error}") from error
 
 
 def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Scenario:

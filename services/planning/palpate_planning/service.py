@@ -29,6 +29,7 @@ from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC
 from palpate_bus.settings import Settings
+from palpate_errors import restate
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.scenario.load import exam_input
@@ -93,13 +94,11 @@ def abdomen_of(mesh: Message, targets: Message, X_WA: Array) -> PerceivedAbdomen
     coincident = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) < COINCIDENT_M)
     if len(coincident):
         raise ValueError(f"perception/targets: {coincident[0]} and {coincident[0] + 1} coincide")
-    try:
+    with restate(ValueError, ValueError, "perception/surface"):
         vertices, normals, triangles, breathing = mesh_arrays(mesh)
         if triangles.max(initial=-1) >= len(vertices):
             raise ValueError(f"triangles of vertex {triangles.max()}, it has {len(vertices)}")
         surface = PerceivedSurface.from_mesh(vertices, normals, X_WA, breathing)
-    except ValueError as error:
-        raise ValueError(f"perception/surface: {error}") from error
     return PerceivedAbdomen(positions, lines, vertices, triangles, surface)
 
 

@@ -16,7 +16,7 @@ from palpate_bus.messages import IndentationTruth, Message, PatientTruth, Phanto
 from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_errors import UserError
+from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array, apply, inverse, matrix
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom
@@ -194,8 +194,6 @@ def simulated(
     PluginError if it cannot simulate this phantom.
     """
     model, breathing = build_phantom(scenario.phantom, scenario.seed), BreathingCurve(scenario.phantom.breathing, scenario.seed)
-    try:
+    with restate(UserError, PluginError, f"services.tissue = {scenario.services.tissue}"):
         backend, facts = make(model, breathing, contract().roles[TissueService.role].period / NS)
-    except UserError as error:
-        raise PluginError(f"services.tissue = {scenario.services.tissue}: {error}") from error
     return carry(TissueService(backend, model, true_pose(scenario), facts), scenario)

@@ -22,6 +22,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
 from palpate_camera.inputs import CameraError, CameraInput, Frame, StaticTransforms
 from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_errors import restate
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Scenario
 
@@ -48,7 +49,7 @@ class ReplayedCamera(Service):
                 raise RecordingError(f"{recording.path}: has no message of {topic}; a camera can be replayed only from all of "
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
         self._transforms = StaticTransforms()
-        try:
+        with restate((CameraError, CodecError), RecordingError, recording.path):
             for pose in _decode(recorded[POSE], contract().topics[POSE].type):  # each sender of a system publishes its own
                 self._transforms.add(pose.message.transforms)
             first = decode(recorded[IMAGE][0].payload, contract().topics[IMAGE].type)
@@ -56,8 +57,6 @@ class ReplayedCamera(Service):
             self._pose = self._transforms.need(WORLD, frame)
             self.frames = _frames(recorded, IMAGE, INFO, frame)
             self._small = _frames(recorded, SMALL_IMAGE, SMALL_INFO, frame)
-        except (CameraError, CodecError) as error:
-            raise RecordingError(f"{recording.path}: {error}") from error
         self._path = recording.path
         self._wanted = 0
         self._shown = self._ticks = 0

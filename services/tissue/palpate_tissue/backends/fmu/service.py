@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from palpate_bus.contract import Contract, contract as default_contract
 from palpate_bus.messages import NS, Message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_errors import RunError, UserError
+from palpate_errors import RunError, UserError, restate
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
@@ -142,16 +142,12 @@ def create(scenario: Scenario) -> Service:
             f"tissue.fmu_map = {chosen.fmu_map}: its role is {table.role}, not tissue; "
             "for another role call `hosted` in a user-defined service (--service ROLE=FILE.py)"
         )
-    try:
+    with restate(UserError, MapError, "services.tissue = fmu", but=MapError):
         if chosen.fmu:
             service = hosted(Path(chosen.fmu), table, scenario)
         else:
             with tempfile.TemporaryDirectory() as folder:
                 service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
-    except MapError:
-        raise
-    except UserError as error:
-        raise MapError(f"services.tissue = fmu: {error}") from error
     return carry(service, scenario)
 
 

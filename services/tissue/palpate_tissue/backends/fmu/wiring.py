@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages import NS, CodecError, Message, blank
 from palpate_bus.messages.fields import LeafField, leaves, numbers
+from palpate_errors import restate
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
@@ -176,10 +177,8 @@ class Wiring:
         return self._contract.topics[name]
 
     def _variable(self, name: str, where: str) -> FmuVariable:
-        try:
+        with restate(FmuError, MapError, where):
             return self._fmu.variable(name)
-        except FmuError as error:
-            raise MapError(f"{where}: {error}") from error
 
     def _ports(self, variables: Iterable[FmuVariable]) -> dict[str, Port]:
         """Return the port of each variable by its name: one port per type."""
@@ -260,10 +259,8 @@ class Wiring:
             raise MapError(f"{where}: the contract's unit is {declared[0]}, not {entry.unit}")
         if text is None or variable.unit is None:
             return _same
-        try:
+        with restate(ValueError, MapError, where):
             ours = parse_unit(text)
-        except ValueError as error:
-            raise MapError(f"{where}: {error}") from error
         theirs = fmu_unit(variable.unit, self._fmu.description)
         if theirs is None:
             raise MapError(f"{where}: the FMU does not define its unit {variable.unit!r}")
