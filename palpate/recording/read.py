@@ -307,9 +307,7 @@ def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[in
     if len(still) < 2:
         return set()
     places = np.array([contacts[k].position[-1, :2] for k in still])
-    presses = [contacts[k] for k in still]
-    loads = loading(presses, [min(depth, float(press.depth.max())) for press in presses])
-    force = np.log(np.maximum(loads.force, 1e-9))
+    force = np.log(np.maximum(loading([contacts[k] for k in still], depth).force, 1e-9))
     wrong: set[int] = set()
     for k, near in enumerate(cKDTree(places).query_ball_point(places, 0.3 * np.sqrt(radius * depth))):
         limit = LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree

@@ -79,19 +79,22 @@ class Loading(NamedTuple):
     """At the depth of each [N], shape (k,)."""
     noise: Array
     """SE of it [N], shape (k,)."""
+    depth: list[float]
+    """[m]"""
     exponent: float
     """Median of n."""
     exponent_sd: float
     """Spread of n from press to press."""
 
 
-def loading(presses: Sequence[Contact], ends: Sequence[float]) -> Loading:
-    """Return the forces of presses at the depths `ends` [m].
+def loading(presses: Sequence[Contact], depth_m: float) -> Loading:
+    """Return the forces of presses at a depth, of those that do not reach it at the depth that they reach.
 
     F = F_D (d / D)^n, with exponents n that scatter about the body's own: each press has its force F_D and exponent n_i by
     non-linear least squares, with the prior n_i ~ N(n, s^2). n and s are those of the body: median and spread of the exponents
     that presses have of their own, less what noise adds to the spread (empirical Bayes).
     """
+    ends = [min(depth_m, float(press.depth.max())) for press in presses]
     rows = []
     for press, end in zip(presses, ends, strict=True):
         depth, force = press.depth, press.force
@@ -106,7 +109,7 @@ def loading(presses: Sequence[Contact], ends: Sequence[float]) -> Loading:
         scatter = 1.4826 * float(np.median(np.abs(exponents - mean)))
         spread = float(np.sqrt(max(scatter**2 - float(np.median(variances)), 1e-4)))
     found = np.array([_fit(*row, mean, spread) for row in rows]).reshape(-1, 4)
-    return Loading(found[:, 0], found[:, 2], mean, spread)
+    return Loading(found[:, 0], found[:, 2], ends, mean, spread)
 
 
 def _fit(log_depth: Array, force: Array, noise: float, mean: float, spread: float) -> tuple[float, float, float, float]:
@@ -157,11 +160,10 @@ class PalpationRecording:
             return []
         nominal = self.depth_m if depth_m is None else depth_m
         presses = self._presses
-        ends = [min(nominal, float(touch.depth.max())) for touch in presses.values()]
-        loads = loading(list(presses.values()), ends)
+        force, noise, depth, *_ = loading(list(presses.values()), nominal)
         samples = [
             _press_sample(touch, number, *load)
-            for (number, touch), load in zip(presses.items(), zip(loads.force, loads.noise, ends, strict=True), strict=True)
+            for (number, touch), load in zip(presses.items(), zip(force, noise, depth, strict=True), strict=True)
         ]
         for number, touch in enumerate(self.touches, start=1):
             if touch.kind is ContactKind.SLIDE:
@@ -173,9 +175,9 @@ class PalpationRecording:
         """The press that the map is of: the abdomen's, or of another body the recorded ones at their nominal depth."""
         if self.abdomen:
             return USUAL
-        presses = list(self._presses.values())
-        loads = loading(presses, [min(self.depth_m, float(touch.depth.max())) for touch in presses])
-        exponent, spread = (loads.exponent, loads.exponent_sd) if presses else (self.exponent, 0.0)
+        exponent, spread = self.exponent, 0.0
+        if presses := list(self._presses.values()):
+            *_, exponent, spread = loading(presses, self.depth_m)
         return PressStandard.of(self.samples(), self.indenter_radius_m, exponent, spread)
 
     @property

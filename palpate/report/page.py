@@ -21,9 +21,10 @@ from palpate.report.files import write_text
 from palpate.report.results import clean_world_note, describe_unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
+from palpate_errors import restate
 from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
+from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import quadrant
 
@@ -51,27 +52,21 @@ def read_report(folder: Path) -> Report:
 
 
 def write_page(folder: Path) -> Path:
-    """Write report.html into the results folder of a run; return its path. Raises EvidenceError."""
+    """Write report.html into the results folder of a run; return its path. Raises EvidenceError, ScenarioError."""
     report, evidence = read_report(folder), read_evidence(folder)
     if report.run != evidence.run:
         raise EvidenceError(f"{folder}: report.json is of run {report.run}, {EVIDENCE} of run {evidence.run}; expected one run")
-    try:
-        scenario = load_scenario(str(folder / "scenario.yaml"))
-    except ScenarioError as error:
-        raise EvidenceError(str(error)) from error
     path = folder / FILE
-    write_text(path, render(scenario, report, evidence, sample_places(folder)))
+    write_text(path, render(load_scenario(str(folder / "scenario.yaml")), report, evidence, sample_places(folder)))
     return path
 
 
 def sample_places(folder: Path) -> Array:
     """Return the xy positions of the samples in A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
     path = folder / "samples.csv"
-    try:
+    with restate((OSError, ValueError), EvidenceError, f"{path} cannot be read"):
         _, *rows = read_text(path).splitlines()
         return np.loadtxt(rows, delimiter=",", usecols=(1, 2), ndmin=2) if rows else np.empty((0, 2))
-    except (OSError, ValueError) as error:
-        raise EvidenceError(f"{path} cannot be read: {error}") from error
 
 
 def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: Array) -> str:

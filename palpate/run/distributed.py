@@ -42,7 +42,6 @@ def run_distributed(
     timing = timing or Timing()
     absent = absent or Absent((), 0.0, lambda _: None)
     roles = (*workers(scenario), *observers)
-    absent.check(roles)
     processes = read_processes(compose_file(), roles)
     started = [process for role, process in processes.items() if role not in absent.roles]
     groups = groups or one_per_process(roles)

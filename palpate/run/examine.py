@@ -52,7 +52,9 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
     console = SteadyConsole(stderr=True)
     absent = Absent(tuple(options.without or ()), options.wait, partial(console.print, soft_wrap=True))
     observers = _observers(scenario, options)
-    groups = placement((*workers(scenario), *observers), options.group or (), options.processes)
+    roles = (*workers(scenario), *observers)
+    absent.check(roles)
+    groups = placement(roles, options.group or (), options.processes)
     folder = options.out or usual_folder(scenario.name)
     display = RunDisplay(console, options.silent, scenario.exam)
     with results_first(), results_folder(folder, overwrite=options.overwrite, begun=lambda: display.begun):
@@ -133,7 +135,7 @@ def _rate(scenario: Scenario) -> float:
     real, emulated = scenario.services.tissue == NONE, scenario.robot.driver.emulated
     given = rate = Settings.read().rate
     if rate is None:
-        measured = measure(TEST.real_processes if scenario.services.tissue == NONE else TEST.simulated_processes)
+        measured = measure(TEST.real_processes if real else TEST.simulated_processes)
         rate = measured.rate
         if rate is None:
             raise UserError(f"this machine cannot keep {RATES[-1]:g} of real time now: {measured.summary}; run in lockstep")

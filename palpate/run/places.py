@@ -17,7 +17,6 @@ import typer
 
 from palpate.service import command as service_command
 from palpate_bus import implementations
-from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run, named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -52,11 +51,6 @@ class Absent:
     tell: Callable[[str], None]
     """Called with the text that says where a role is awaited."""
     _sentences: dict[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for role in self.roles:
-            if role not in contract().served:
-                raise UserError(f"--without {role}: allowed are {', '.join(contract().served)}")
 
     def check(self, roles: Collection[str]) -> None:
         """Raise UserError for a role that this run does not have."""

@@ -55,7 +55,7 @@ def refused(*words: str) -> str:
         ("--composed --realtime", ("--composed", "--realtime")),
         ("--composed --secure", ("--secure",)),
         ("--secure --keys none", ("ca.pem",)),
-        ("--without arm", ("--without arm: allowed are robot, tissue",)),
+        ("--without arm", ("--without arm: this run has no arm, but robot, tissue",)),
         ("--group robot,arm", ("there is no role 'arm'",)),
         ("--group robot,control --group tissue,robot", ("robot is in a group already",)),
         ("--group robot,dashboard", ("an observer has its own process",)),

@@ -132,7 +132,7 @@ def test_force_and_exponent_are_those_of_the_body(exponent: float, spread: float
     depth, noise = np.linspace(0.0, 0.002, 10), 0.03
     level, own = 1.0 + 0.2 * rng.standard_normal(200), exponent + spread * rng.standard_normal(200)
     forces = [f * (depth / 0.002) ** n + noise * rng.standard_normal(10) for f, n in zip(level, own, strict=True)]
-    found = loading([pressed(depth, force, noise) for force in forces], [0.002] * 200)
+    found = loading([pressed(depth, force, noise) for force in forces], 0.002)
     assert found.exponent == pytest.approx(exponent, rel=0.05)
     assert found.exponent_sd == pytest.approx(spread, abs=0.15)
     z = (found.force - level) / found.noise
@@ -141,7 +141,7 @@ def test_force_and_exponent_are_those_of_the_body(exponent: float, spread: float
 
 
 def test_a_press_of_one_reading_keeps_it() -> None:
-    found = loading([pressed(np.array((0.002,)), np.array((0.7,)), 0.01)], [0.002])
+    found = loading([pressed(np.array((0.002,)), np.array((0.7,)), 0.01)], 0.002)
     assert found.force == pytest.approx((0.7,))
 
 
