@@ -9,7 +9,7 @@ from scipy.ndimage import binary_closing, find_objects, label, median_filter
 from scipy.signal import find_peaks
 
 from palpate.recording.motion import TUNING
-from palpate_models.numerics.frames import Array, Indices
+from palpate_models.numerics.frames import Array, Indices, path_length
 
 POWERS: Final = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 """Powers of depth that the force of loading is compared with."""
@@ -159,11 +159,6 @@ def cycles(position: Array, inward: Array, force: Array, radius: float) -> list[
     together = max(1, round(FOOTPRINT_SHARE * footprint / usual))
     parts = [cycle[k : k + together] for k in range(0, len(cycle), together)]
     return [slice(part[0].start, part[-1].stop) for part in parts]
-
-
-def path_length(position: Array) -> Array:
-    """Return the length of the path up to each reading [m], shape (k,)."""
-    return np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))
 
 
 def windows(lateral: Array, travel: float) -> list[Indices]:

@@ -16,7 +16,7 @@ from palpate.recording.motion import TUNING, Axis, delay, delay_force, free_air,
 from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Palpated
 from palpate.recording.skin import RecordedSkin, fit_skin, grid_over, of_mesh
-from palpate_models.numerics.frames import Array, inverse
+from palpate_models.numerics.frames import Array, inverse, path_length
 
 _TRAVEL: Final = (0.005, 4.0)
 """Plausible travel of a contact along the normal, in radii of the tool."""
@@ -187,7 +187,7 @@ class _Measured:
         normal = self.outward if self.skin is None else self.skin.at(p[:1, :2])[1][0]
         inward, whole = -(p @ normal), self.readings.whole[one]
         if motion is _Motion.CYCLE:
-            middle, along = p.mean(axis=0), cutting.path_length(across(p, normal))
+            middle, along = p.mean(axis=0), path_length(across(p, normal))
             force = normal_force(self.readings.force[one], normal)
             return _Loading(normal, inward[whole], force[whole], middle, float(inward.mean()), (along - along.mean())[whole])
         force = normal_force(self.readings.force[one], normal)
@@ -256,7 +256,7 @@ class _Measured:
         z, normal, sd = self.skin.at(p[:, :2])
         parts = cutting.windows(across(p, self.outward), self.reach)
         if kept is not None and len(parts) > 1:
-            way = cutting.path_length(across(p, self.outward))
+            way = path_length(across(p, self.outward))
             path = make_interp_spline([way[part].mean() for part in parts], [p[part, 2].mean() for part in parts], k=1)
             z, sd = path(way) + kept / normal[:, 2], np.full(len(p), _FOLLOWS * kept)
         depth = (z - p[:, 2]) * normal[:, 2]

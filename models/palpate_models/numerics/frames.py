@@ -51,6 +51,12 @@ def apply(X_AB: Array, p_B: Array) -> Array:
     return np.asarray(p_B @ X_AB[:3, :3].T + X_AB[:3, 3])
 
 
+def path_length(points: Array, least: float = 0.0) -> Array:
+    """Return the length of a path up to each of its points, shape (n,); a step counts as at least `least`."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate(([0.0], np.cumsum(np.maximum(steps, least))))
+
+
 def look_at(position: Array, target: Array) -> Array:
     """Return the pose of an optical frame (z forward, x right, y down) looking from `position` at `target`, shape (4, 4)."""
     z = target - position

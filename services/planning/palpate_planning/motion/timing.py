@@ -10,7 +10,7 @@ import numpy as np
 import ruckig
 
 from palpate_errors import RunError
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, path_length
 from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS
@@ -174,7 +174,7 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     points = points[np.concatenate(([True], lengths > 1e-9))]
     if len(points) < 2:
         return JointTrajectory(points[:1].copy(), np.zeros_like(points[:1]))
-    knots = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    knots = path_length(points)
     s = np.unique(np.concatenate([np.linspace(a, b, max(2, round((b - a) / 0.02) + 1)) for a, b in pairwise(knots)]))
     q = np.column_stack([np.interp(s, knots, points[:, i]) for i in range(points.shape[1])])
     tangent = np.gradient(q, s, axis=0)

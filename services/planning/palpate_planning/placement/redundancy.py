@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import cKDTree
 
-from palpate_models.numerics.frames import Array, Mask
+from palpate_models.numerics.frames import Array, Mask, path_length
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.fitting import seeds_of
 from palpate_models.scenario.schema import Robot
@@ -219,16 +219,10 @@ def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
     return q
 
 
-def _path_length(positions: Array) -> Array:
-    """Return the length along the path at each point [m], strictly increasing, shape (n,)."""
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-6))))
-
-
 def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
     """Return indices of the optimised targets: reachable, evenly spaced along the path, ends included."""
     candidates = np.flatnonzero(reachable)
-    s = _path_length(batch.positions)[candidates]
+    s = path_length(batch.positions, least=1e-6)[candidates]
     wanted = np.linspace(s[0], s[-1], min(POSTURES.knots, len(candidates)))
     nearest = np.unique(np.abs(s[None, :] - wanted[:, None]).argmin(axis=1))
     return np.asarray(candidates[nearest])
@@ -257,7 +251,7 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> Array | No
     if reachable.sum() < 2 or len(knots := _knots(batch, reachable)) < 2:
         return None
     solver = _program(_at_origin(robot), len(knots), batch.force)
-    s = _path_length(batch.positions)
+    s = path_length(batch.positions, least=1e-6)
     spacing = np.diff(s[knots])
     weights = spacing.mean() / spacing
     parameters = np.concatenate(

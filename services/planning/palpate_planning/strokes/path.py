@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, Ints
+from palpate_models.numerics.frames import Array, Ints, path_length
 from palpate_planning.motion.timing import SpeedLimit
 from palpate_planning.wall.surface import CubicPieces, PerceivedSurface, cubic_at
 
@@ -189,5 +189,4 @@ def frames_along(surface: PerceivedSurface, xy: Array, R_ref: Array) -> tuple[Ar
     shape (k, 3, 3).
     """
     p, n = surface.at(xy)
-    s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
-    return s, p, n, least_twist(-n, R_ref)
+    return path_length(p), p, n, least_twist(-n, R_ref)
