@@ -133,8 +133,7 @@ def marked_share(marked: Sequence[Marked], shape: Bump) -> float:
     """Return the overlap coefficient of a shape and the skin that the user has marked as scarred: of the marking that fits best,
     the common area over the smaller of both, so that a short scar is not lost in a wider shape.
     """
-    points = np.array(shape.path or ((shape.x, shape.y),))
-    low, high = points.min(axis=0) - shape.radius, points.max(axis=0) + shape.radius
+    low, high = shape.corners.min(axis=0) - shape.radius, shape.corners.max(axis=0) + shape.radius
     xy = np.stack(np.meshgrid(*np.linspace(low, high, 25).T), axis=-1).reshape(-1, 2)
     inside = xy[shape.distance(xy) < shape.radius]
     scars = [ridge(np.array(one.path_m), one.width_m / 2, 1e-3) for one in marked] if len(inside) else []

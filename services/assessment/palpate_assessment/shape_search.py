@@ -119,7 +119,7 @@ def _best(
             break
     found = []
     for first in firsts:
-        points = np.array(first.path or ((first.x, first.y),)).ravel()
+        points = first.corners.ravel()
         limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
         start: Array = np.clip((*points, np.log(first.radius), np.log(first.edge)), limits.lb, limits.ub)
         simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
@@ -143,7 +143,7 @@ def _grow(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
     while grows:
         grows = False
         for forward in (1, -1):
-            corners = np.array(band.path)[::forward]
+            corners = band.corners[::forward]
             along = (corners[-1] - corners[-2]) / np.linalg.norm(corners[-1] - corners[-2])
             longer = [ridge(np.vstack((corners, corners[-1] + step * turn @ along)), band.radius, band.edge) for turn in turns]
             longer = [one for one in longer if _is_possible(regression, one)]
@@ -157,7 +157,7 @@ def _is_possible(regression: Regression, bump: Bump) -> bool:
     """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
     o = regression.observations
     if (places := o.standard.places) is not None and not (
-        places.encloses(np.array(bump.path or ((bump.x, bump.y),))).all()
+        places.encloses(bump.corners).all()
         and bump.radius <= SEARCH.narrow * o.width
         and places.encloses(bump.outline()).mean() >= SEARCH.surrounded
     ):

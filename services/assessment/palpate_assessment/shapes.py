@@ -35,9 +35,14 @@ class Bump(NamedTuple):
     """Corners of a ridge's middle line [m]; empty for a disc."""
 
     @property
+    def corners(self) -> Array:
+        """Corners of a ridge's middle line, or the centre of a disc [m], shape (k, 2)."""
+        return np.array(self.path or ((self.x, self.y),))
+
+    @property
     def length(self) -> float:
         """Length of a ridge's path [m], 0 for a disc."""
-        return float(np.linalg.norm(np.diff(np.array(self.path).reshape(-1, 2), axis=0), axis=1).sum())
+        return float(np.linalg.norm(np.diff(self.corners, axis=0), axis=1).sum())
 
     @property
     def area(self) -> float:
@@ -48,7 +53,7 @@ class Bump(NamedTuple):
         """Return the distance of places from the centre or the path [m], shape (k, 2) -> (k,)."""
         if not self.path:
             return np.hypot(xy[:, 0] - self.x, xy[:, 1] - self.y)
-        corners = np.array(self.path)
+        corners = self.corners
         start, along = corners[:-1], np.diff(corners, axis=0)
         off = xy[:, None] - start
         length2 = np.maximum((along**2).sum(axis=1), np.finfo(float).tiny)  # a search may bring both ends to one corner
@@ -63,8 +68,8 @@ class Bump(NamedTuple):
         """Return points of its boundary [m], shape (k, 2): of a disc a circle, of a ridge both sides and the ends."""
         around = self.radius * np.column_stack((np.cos(_AROUND), np.sin(_AROUND)))
         if not self.path:
-            return np.asarray(around + np.array((self.x, self.y)))
-        corners = np.array(self.path)
+            return np.asarray(around + self.corners)
+        corners = self.corners
         along = np.diff(corners, axis=0) / np.linalg.norm(np.diff(corners, axis=0), axis=1)[:, None]
         aside = self.radius * np.column_stack((-along[:, 1], along[:, 0]))
         middles = 0.5 * (corners[1:] + corners[:-1])
@@ -73,8 +78,7 @@ class Bump(NamedTuple):
 
     def apart(self, other: Bump) -> float:
         """Return the distance between two bumps over the sum of their radii."""
-        points = np.array(other.path or ((other.x, other.y),))
-        return float(self.distance(_fill(points)).min()) / (self.radius + other.radius)
+        return float(self.distance(_fill(other.corners)).min()) / (self.radius + other.radius)
 
 
 def _fill(corners: Array) -> Array:
