@@ -46,10 +46,8 @@ def join_bus(connect: Sequence[str] | None, run: str | None, domain: int | None)
 
 def _wait_for_links(bus: zenoh.Session, options: BusOptions) -> None:
     """Wait until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBusError if none has."""
-    wanted = len(options.connect) + bool(options.router)
     end = monotonic() + LINK_TIMEOUT_S
-    while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:
+    while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < len(options.asked) and monotonic() < end:
         sleep(0.02)
-    if wanted and not links:
-        tried = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        raise NoBusError(f"no answer at {tried}")
+    if options.asked and not links:
+        raise NoBusError(f"no answer at {', '.join(options.asked)}")

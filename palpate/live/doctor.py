@@ -114,8 +114,7 @@ def _endpoints(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
     links = {str(zid) for zid in (*bus.session.info.peers_zid(), *bus.session.info.routers_zid())}
     there = {entity.node: entity.zid for entity in live.graph.alive.values()}
     if run is None or options.mode == "client":
-        where = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        text = f"{where}: {len(links)} links, domain {bus.target.domain}"
+        text = f"{', '.join(options.asked)}: {len(links)} links, domain {bus.target.domain}"
         yield Remark("endpoints", Severity.OK if links else Severity.BAD, text)
         return
     silent = [role for role in run.endpoints if there.get(role) not in links]

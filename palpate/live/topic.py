@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from math import inf
 from time import monotonic
 from typing import Annotated, Any, Final, NamedTuple
@@ -18,6 +18,7 @@ from rich.text import Text
 from palpate.console import print_json, print_line, say, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
+from palpate.run.options import takes
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec, nanoseconds
 from palpate_bus.runs.announcement import NoBusError
@@ -45,7 +46,6 @@ TOPIC: Final = TopicTimes()
 
 app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
-Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop after this long; by default Ctrl-C ends it.")]
 
 
 @app.command("list")
@@ -114,25 +114,42 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
         wide_console().print(part)
 
 
+@dataclass(frozen=True)
+class StreamOptions:
+    """The topic that a command receives, on which bus, and for how long."""
+
+    name: Name
+    connect: Connect = None
+    run: ChosenRun = None
+    domain: Domain = None
+    as_json: AsJson = False
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0)] = None
+    """Stop after this long; by default Ctrl-C ends it."""
+
+
+@dataclass(frozen=True)
+class EchoOptions(StreamOptions):
+    """Selection and form of the printed messages."""
+
+    field: Annotated[str | None, typer.Option()] = None
+    """Only this field, e.g. wrench.force."""
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1)] = None
+    """Stop after N messages."""
+    once: Annotated[bool, typer.Option("--once")] = False
+    """Stop after one message."""
+    full: Annotated[bool, typer.Option("--full")] = False
+    """Print long arrays in full."""
+
+
 @app.command()
-def echo(  # noqa: PLR0913 - the options of a command
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    field: Annotated[str | None, typer.Option(help="Only this field, e.g. wrench.force.")] = None,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after N messages.")] = None,
-    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
-    seconds: Seconds = None,
-) -> None:
+@takes(EchoOptions)
+def echo(options: EchoOptions) -> None:
     """Print the messages of a topic as they arrive."""
-    left = 1 if once else count
-    with _subscribe(name, connect, run, domain) as (topic, reader):
-        for received in _until(reader, seconds):
-            value = plain(_message(received, topic), full=full or as_json, path=field)
-            if as_json:
+    left = 1 if options.once else options.count
+    with _subscribe(options) as (topic, reader):
+        for received in _until(reader, options.seconds):
+            value = plain(_message(received, topic), full=options.full or options.as_json, path=options.field)
+            if options.as_json:
                 print_line({"topic": topic.name, "sequence": received.sequence, "sent_ns": received.sent, "message": value})
             else:
                 print(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=120), end="---\n", flush=True)
@@ -142,41 +159,29 @@ def echo(  # noqa: PLR0913 - the options of a command
 
 
 @app.command()
-def hz(
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    seconds: Seconds = None,
-) -> None:
+@takes(StreamOptions)
+def hz(options: StreamOptions) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
-    with _subscribe(name, connect, run, domain) as (topic, reader):
+    with _subscribe(options) as (topic, reader):
         rows: deque[tuple[int, int | None]] = deque(maxlen=TOPIC.spacing_messages)
-        for received in _each_period(reader, seconds):
+        for received in _each_period(reader, options.seconds):
             rows.extend((message.sent, _stamp_ns(message, topic)) for message in received)
-            _print_rate(list(rows)[-len(received) - 1 :], topic, as_json)
+            _print_rate(list(rows)[-len(received) - 1 :], topic, options.as_json)
         if len(rows) > 1:
-            _print_rate(list(rows), topic, as_json, whole=True)
+            _print_rate(list(rows), topic, options.as_json, whole=True)
 
 
 @app.command()
-def bw(
-    name: Name,
-    connect: Connect = None,
-    run: ChosenRun = None,
-    domain: Domain = None,
-    as_json: AsJson = False,
-    seconds: Seconds = None,
-) -> None:
+@takes(StreamOptions)
+def bw(options: StreamOptions) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
-    with _subscribe(name, connect, run, domain) as (topic, reader):
+    with _subscribe(options) as (topic, reader):
         window: deque[list[int]] = deque(maxlen=TOPIC.bandwidth_periods)
-        for received in _each_period(reader, seconds):
+        for received in _each_period(reader, options.seconds):
             window.append([len(message.payload) for message in received])
             sizes = [size for period in window for size in period]
             rate, mean = sum(sizes) / (len(window) * TOPIC.report_period_s), sum(sizes) / max(len(sizes), 1)
-            if as_json:
+            if options.as_json:
                 print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
             else:
                 size = f"{mean:.0f} B per message, {min(sizes, default=0)} to {max(sizes, default=0)}"
@@ -203,10 +208,10 @@ def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
 
 
 @contextmanager
-def _subscribe(name: str, connect: list[str] | None, run: str | None, domain: int | None) -> Iterator[tuple[Topic, Subscription]]:
-    """Join the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
-    with join_bus(connect, run, domain) as bus:
-        name = name.strip("/")
+def _subscribe(options: StreamOptions) -> Iterator[tuple[Topic, Subscription]]:
+    """Join the bus and subscribe to a topic: the contract's, or any that is there with a known message type."""
+    with join_bus(options.connect, options.run, options.domain) as bus:
+        name = options.name.strip("/")
         row = contract().topics.get(name)
         if row is None:
             found = graph.ends(graph.present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)

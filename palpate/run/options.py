@@ -3,7 +3,7 @@
 import ast
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import update_wrapper
 from itertools import pairwise
 from pathlib import Path
@@ -82,8 +82,8 @@ def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., Non
     for row, doc in pairwise(body):
         if isinstance(row, ast.AnnAssign) and isinstance(doc, ast.Expr):
             hints[ast.unparse(row.target)].__metadata__[0].help = inspect.cleandoc(ast.literal_eval(doc.value)).replace("\n", " ")
-    kind = inspect.Parameter.KEYWORD_ONLY
-    rows = [(row.name, row.default) for row in fields(options)]  # type: ignore[arg-type]
+    kind, required = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.empty
+    rows = [(row.name, required if row.default is MISSING else row.default) for row in fields(options)]  # type: ignore[arg-type]
     parameters = [inspect.Parameter(name, kind, default=default, annotation=hints[name]) for name, default in rows]
 
     def decorate(command: Callable[[T], None]) -> Callable[..., None]:

@@ -98,13 +98,18 @@ class BusOptions:
             raise BusConfigError(f"PALPATE_MODE is {self.mode!r}; allowed: peer, client, router")
         if self.mode == "client" and not (self.router or self.connect or self.zenoh_config):
             raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT is set")
-        for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
+        for endpoint in (*self.listen, *self.asked):
             _check_endpoint(endpoint)
             if self.tls is not None and not endpoint.startswith("tls/"):
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}, but {endpoint!r} is not encrypted; expected tls/<host>:<port>")
         for name in TLS_FILES if self.tls is not None else ():
             if self.tls is not None and not (self.tls / name).is_file():
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """The endpoints that it connects to."""
+        return (*self.connect, self.router) if self.router else self.connect
 
     @classmethod
     def from_settings(cls, settings: Settings) -> "BusOptions":
@@ -146,7 +151,6 @@ def zenoh_config(options: BusOptions) -> zenoh.Config:
 
 
 def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
-    connect = [*options.connect, *([options.router] if options.router else [])]
     listen = list(options.listen)
     if not listen and options.mode == "peer" and options.router:
         listen = ["tcp/[::]:0"]  # gossip announces a peer behind a router to others, so it must be reachable
@@ -155,7 +159,7 @@ def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
         "scouting/multicast/enabled": False,
         # Without a router the launcher lists every peer, and gossip would build a second set of links.
         "scouting/gossip/enabled": options.router is not None or options.mode == "router",
-        "connect/endpoints": connect,
+        "connect/endpoints": list(options.asked),
         # Peers start in any order. The default first retry comes after one second, which would be most of a start.
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
         # Opening does not wait for peers (half a second by default): the runtime's hello does, on every edge.
@@ -225,9 +229,8 @@ def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | 
 def _description(options: BusOptions) -> str:
     """Return a text with the endpoints of a session."""
     listens = f"that listens at {', '.join(options.listen)}" if options.listen else "that listens nowhere"
-    asked = [*options.connect, *([options.router] if options.router else [])]
     keys = f" with the keys in {options.tls}" if options.tls is not None else ""
-    return listens + (f" and connects to {', '.join(asked)}" if asked else "") + keys
+    return listens + (f" and connects to {', '.join(options.asked)}" if options.asked else "") + keys
 
 
 def _reason(error: zenoh.ZError) -> str:
