@@ -29,12 +29,17 @@ class Problem(NamedTuple):
     text: str
 
 
-SETPOINT_DISTANCE_MAX_M: Final = 0.1
-"""A Cartesian set-point that is farther from the tool does not come from planning, which starts where the arm is."""
-MOVING_RADPS: Final = 0.05
-STANDING: Final = 5
-"""Set-points in a row that repeat a posture while its velocity is above `MOVING_RADPS`. The arm would stay, and planning, which
-waits for it, would blame the torques."""
+class SetpointLimits(NamedTuple):
+    """Limits beyond which a set-point is refused."""
+
+    distance_m: float = 0.1
+    """From the tool to a Cartesian set-point: planning starts where the arm is."""
+    standing: int = 5
+    """Set-points in a row that repeat a posture at a velocity above `moving_radps`: planning would wait for an arm that stays."""
+    moving_radps: float = 0.05
+
+
+SETPOINT: Final = SetpointLimits()
 NO_PROBLEM: Final = Problem("", "")
 _NONE: Final = np.zeros(0)
 
@@ -156,8 +161,8 @@ class ControlService(Service):
         before, self._received = self._received, setpoint
         speed = float(np.abs(setpoint.qd).max())
         repeats = before is not None and setpoint.stamp > before.stamp and np.array_equal(setpoint.q, before.q)
-        self._standing = self._standing + 1 if repeats and speed > MOVING_RADPS else 0
-        if self._standing >= STANDING:
+        self._standing = self._standing + 1 if repeats and speed > SETPOINT.moving_radps else 0
+        if self._standing >= SETPOINT.standing:
             self._refuse(t, f"joint_position stands while joint_velocity is {speed:.2f} rad/s")
             return
         while self._pending and self._pending[-1].stamp >= setpoint.stamp:
@@ -182,9 +187,9 @@ class ControlService(Service):
         if self._positions:
             self.model.update_kinematics(q)  # the law evaluates it at the commanded positions
         gap = setpoint.p_WD - self.model.p_WI
-        if gap.dot(gap) <= SETPOINT_DISTANCE_MAX_M**2:
+        if gap.dot(gap) <= SETPOINT.distance_m**2:
             return ""
-        return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {SETPOINT_DISTANCE_MAX_M:g} m"
+        return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {SETPOINT.distance_m:g} m"
 
     def _wait(self, t: int, joints: Message | None) -> Outbox:
         """Return the command before the first set-point: zero torque, or the positions measured first."""
