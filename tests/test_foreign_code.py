@@ -114,7 +114,7 @@ def test_a_service_that_cannot_be_loaded_is_named(
 
 
 @pytest.mark.parametrize(
-    ("how", "text"), [("exit0", "tissue lost at its end: left with status 0"), ("leave", "tissue lost at 2.000 s: SystemExit: 0")]
+    ("how", "text"), [("exit0", "tissue lost at its end: left with status 0"), ("leave", "tissue lost at 1.200 s: SystemExit: 0")]
 )
 def test_a_service_that_exits_at_its_end_leaves_what_was_measured(how: str, text: str, toys: Toys, tmp_path: Path) -> None:
     toys.at_end = how
