@@ -152,17 +152,17 @@ class RefusedMessage(RunError):
 class PortCheck:
     """Check of the messages of one topic at one port."""
 
-    __slots__ = ("_conforms", "_topic", "past")
+    __slots__ = ("_topic", "conforms", "past")
 
     def __init__(self, topic: Topic, sends: bool = False) -> None:
         """`sends`: stamps must be of the sender's present."""
         self._topic = topic
-        self._conforms = compile_check(topic.model_dump_json(), sends)
+        self.conforms = compile_check(topic.model_dump_json(), sends)
         self.past = PastMessages([0] * len(topic.varies))
 
     def __call__(self, message: Message, t: int) -> None:
         """Raise RefusedMessage if the message breaks the contract. `t`: time at the port [ns]."""
-        if not self._conforms(message, self.past, t):
+        if not self.conforms(message, self.past, t):
             raise RefusedMessage(self._topic, self._violation(message, t), message)
 
     def _violation(self, message: Message, t: int) -> MessageViolation:
