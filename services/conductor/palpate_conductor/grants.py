@@ -23,7 +23,7 @@ class GrantTuning(NamedTuple):
     window_ns: int = 500 * MS
     """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
     ahead_ns: int = NS
-    """Simulated time [ns] beyond exam state and recording that is never passed, by a step of an operator neither."""
+    """Maximum simulated time [ns] granted beyond the newest exam state and the recording, also by an operator's steps."""
     wallclock_lead_ns: int = 200 * MS
     """Time from the start message to the common start [ns]."""
     regrant_s: float = 0.5
