@@ -21,7 +21,7 @@ def received(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes
     """Return the message that the subscriber receives within ten seconds of repeated sending."""
     queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
     declared = subscriber.declare_subscriber(key, zenoh.handlers.Callback(queue.put, indirect=False))
-    wait_until(lambda: publisher.put(key, payload) or not queue.empty(), 10)
+    wait_until(lambda: not queue.empty() or publisher.put(key, payload), 10)
     declared.undeclare()
     return None if queue.empty() else queue.get().payload.to_bytes()
 
