@@ -26,8 +26,6 @@ _TICK = round(DT * NS)
 _STATUS_PERIOD = contract().topics["robot/status"].period
 _LINKS_PERIOD = contract().topics["sim/link_poses"].period
 _CONTACT_AGE = contract().topics["sim/contact_wrench"].max_age
-_MOST_STEPS = 50
-"""Maximum number of plant steps in one tick, after an overrun in wall-clock mode."""
 
 
 class RobotService(Service):
@@ -97,16 +95,23 @@ class RobotService(Service):
         return {**self._driver.facts(), "peak_external_force_N": self._peak_force}
 
     def _drive(self, t: int, inbox: Inbox) -> None:
-        """Step driver and plant up to `t`. The first tick is the initial state."""
+        """Step driver and plant up to `t`. The first tick is the initial state.
+
+        In wall-clock mode a slow machine skips ticks. No command came in this time: the arm brakes, as a real one does.
+        """
         plant, driver, joints = self._plant, self._driver, self._joints
-        steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
+        steps = 0 if self._t is None else (t - self._t) // _TICK
         self._t = t
         command = self._commands.newest(inbox.latest("control/joint_torque"))
         self._read_contact(t, inbox)
+        if steps * _TICK > TUNING.validity_ns and driver.mode is DriverMode.ACTIVE:
+            reason = f"this machine is too slow: the simulation of the arm stood still for {steps * DT * 1e3:.0f} ms"
+            driver.hold(t, HoldCause.COMMAND_EXPIRED, reason, self.role)
+            self._clear_readings()
         for step in range(steps):
             gravity = plant.gravity_torque()
             values = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
-            age = 0 if command is None else max(t - (steps - 1 - step) * _TICK - command.stamp, -TUNING.validity_ns)
+            age = 0 if command is None else t - (steps - 1 - step) * _TICK - command.stamp
             torque, damping = self._act(values, gravity, age)
             driven = gravity + torque
             plant.step(driven, self._force_W if self._pressed else None, self._moment_W, damping)
@@ -139,7 +144,7 @@ class RobotService(Service):
         if self._pressed and received is not None and t - received > _CONTACT_AGE:
             age, limit = (t - received) / 1e6, _CONTACT_AGE / 1e6
             reason = f"no message on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
-            self._driver.hold(t, HoldCause.DEVICE, reason, "sim/contact_wrench")
+            self._driver.hold(t, HoldCause.COMMAND_EXPIRED, reason, "sim/contact_wrench")
         f, m = message.wrench.force, message.wrench.torque
         self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
         if self._pressed:
@@ -170,10 +175,11 @@ class RobotService(Service):
         if self._drive_torques:
             torque = (np.add.reduce(self._drive_torques) - np.add.reduce(self._friction_torques)) / len(self._drive_torques)
             self._measured_torque = self._torque_sensors.read(self._plant.q, self._plant.v, torque, len(self._drive_torques))
-        self._drive_torques.clear()
-        self._friction_torques.clear()
-        self._joint_readings.clear()
-        self._ft_readings.clear()
+        self._clear_readings()
         state, n = (int(driver.mode), int(driver.cause), driver.reason), len(self._names)
         sensed, faults = (mean[:n], mean[n:], wrench_message(wrench)), (driver.rejected, driver.culprit)
         return RobotStatus(Header(stamp, ""), *state, *sensed, self._applied, *faults, self._measured_torque)
+
+    def _clear_readings(self) -> None:
+        for readings in (self._drive_torques, self._friction_torques, self._joint_readings, self._ft_readings):
+            readings.clear()

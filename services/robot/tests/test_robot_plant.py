@@ -321,6 +321,16 @@ def test_late_and_missed_commands_do_not_jerk_it() -> None:
             assert np.abs(arm.plant.v - speed).max() < 0.02
 
 
+def test_an_arm_that_falls_behind_its_commands_keeps_their_speed() -> None:
+    """By the wall clock the simulation falls behind control, here at half its pace."""
+    arm, speed = Arm(DartPlant), 0.3
+    for k in range(380):
+        newest = k + max(k - 200, 0)
+        arm.step(HOME + speed * newest * DT, age=(k - newest) * MS)
+        if k > 200:
+            assert np.abs(arm.plant.v - speed).max() < 0.02
+
+
 @pytest.mark.parametrize("plant", [DartPlant, MujocoPlant])
 def test_a_load_hardly_moves_it(plant: type) -> None:
     arm = Arm(plant)

@@ -128,7 +128,21 @@ def test_in_contact_with_tissue_that_stands_still_it_holds(rig: Rig) -> None:
     rig.servo(100)
     assert rig.mode[0] == RobotStatus.MODE_ACTIVE
     rig.servo(12)
-    assert rig.mode == (RobotStatus.MODE_SAFE_HOLD, RobotStatus.CAUSE_DEVICE)
+    assert rig.mode == (RobotStatus.MODE_SAFE_HOLD, RobotStatus.CAUSE_COMMAND_EXPIRED)
+
+
+def test_a_simulation_that_stood_still_brakes_and_states_the_present(rig: Rig) -> None:
+    for k in range(100):
+        rig.servo(1, lbr.HOME + 0.0005 * k)
+    before = rig.outbox["joint_states"]
+    assert np.abs(before.velocity).max() > 0.2
+    rig.t += 219 * MS
+    rig.servo(1, lbr.HOME + 0.05)
+    now = rig.outbox["joint_states"]
+    assert rig.mode == (RobotStatus.MODE_SAFE_HOLD, RobotStatus.CAUSE_COMMAND_EXPIRED)
+    assert rig.status.culprit == "robot" and np.abs(now.velocity).max() < 0.01
+    assert np.abs(now.position - before.position).max() < 0.02
+    np.testing.assert_allclose(rig.status.position, now.position, atol=1e-4)
 
 
 def test_a_controller_that_gives_up_is_obeyed_however_far_its_clock_is_ahead(rig: Rig) -> None:

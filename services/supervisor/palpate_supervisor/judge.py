@@ -96,6 +96,8 @@ class MotionAgreement:
     WINDOW_S: Final = 0.5
     LIMIT_RAD: Final = 0.03
     """Three times the error of a velocity that lags by 10 ms while it changes by 1 rad/s."""
+    LONGEST_S: Final = 0.05
+    """Between measurements that are farther apart the velocity is not known: the arm may have braked."""
     JUMP_RADPS: Final = 4.0
     """Faster than any joint: a jump, which other checks name."""
     AGAINST_RAD: Final = 1e-3
@@ -111,7 +113,7 @@ class MotionAgreement:
         """Return the breaches at a measurement, `since_s` [s] after the one before."""
         before, self._before = self._before, measured
         moved = measured.q - (measured.q if before is None else before.q)
-        if before is None or not 0 < since_s < self.WINDOW_S or _largest(moved) > self.JUMP_RADPS * since_s:
+        if before is None or not 0 < since_s < self.LONGEST_S or _largest(moved) > self.JUMP_RADPS * since_s:
             self._gap = np.zeros_like(measured.q)
             return []
         turned = 0.5 * (measured.qd + before.qd) * since_s

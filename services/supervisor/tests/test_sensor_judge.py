@@ -188,6 +188,13 @@ def test_positions_agree_with_velocities(lie: str, seen: bool) -> None:
     assert bool(found) == seen
 
 
+def test_an_arm_that_braked_between_two_late_measurements_is_no_sensor_fault() -> None:
+    agreement, moving, still = MotionAgreement(), np.full(7, 0.5), np.zeros(7)
+    found = [agreement.judge(Measurement(moving * DT * k, moving, np.zeros(6), still), DT) for k in range(20)]
+    found.append(agreement.judge(Measurement(moving * (DT * 19 + 0.01), still, np.zeros(6), still), 0.2))
+    assert not any(found)
+
+
 @pytest.mark.parametrize(
     ("stated", "seen"),
     [
