@@ -96,6 +96,8 @@ class MotionAgreement:
     WINDOW_S: Final = 0.5
     LIMIT_RAD: Final = 0.03
     """Three times the error of a velocity that lags by 10 ms while it changes by 1 rad/s."""
+    LATE_S: Final = 0.02
+    """Positions may be as old as the contract allows for `joint_states`, and more or less so from one status to the next."""
     LONGEST_S: Final = 0.05
     """Between measurements that are farther apart the velocity is not known: the arm may have braked."""
     JUMP_RADPS: Final = 4.0
@@ -108,6 +110,7 @@ class MotionAgreement:
         self._before: Measurement | None = None
         self._gap = np.zeros(0)
         self._against = 0
+        self._fast = 0.0  # greatest speed within about the window [rad/s]
 
     def judge(self, measured: Measurement, since_s: float) -> list[Breach]:
         """Return the breaches at a measurement, `since_s` [s] after the one before."""
@@ -120,11 +123,12 @@ class MotionAgreement:
         pairs = zip(moved.tolist(), turned.tolist(), strict=True)
         against = any(a * b < 0 and min(abs(a), abs(b)) > self.AGAINST_RAD for a, b in pairs)
         self._against = self._against + 1 if against else 0
-        gap = (self._gap + moved - turned) * exp(-since_s / self.WINDOW_S)
-        most = 2 * self.LIMIT_RAD  # it is over within the window when they agree again
-        self._gap = np.minimum(np.maximum(gap, -most), most)
-        if (apart := _largest(self._gap)) > self.LIMIT_RAD:
-            reason = f"positions and velocities disagree by {apart:.2f} rad, limit {self.LIMIT_RAD:g} rad"
+        faded = exp(-since_s / self.WINDOW_S)
+        self._fast = max(self._fast * faded, _largest(measured.qd))
+        limit = self.LIMIT_RAD + self.LATE_S * self._fast
+        self._gap = np.clip((self._gap + moved - turned) * faded, -2 * limit, 2 * limit)  # over within the window once they agree
+        if (apart := _largest(self._gap)) > limit:
+            reason = f"positions and velocities disagree by {apart:.2f} rad, limit {limit:.2f} rad"
         elif self._against > 1:
             reason = "positions move against the velocities"
         else:

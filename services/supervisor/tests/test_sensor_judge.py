@@ -188,6 +188,13 @@ def test_positions_agree_with_velocities(lie: str, seen: bool) -> None:
     assert bool(found) == seen
 
 
+def test_positions_of_a_fast_arm_that_are_late_are_no_sensor_fault() -> None:
+    agreement, fast = MotionAgreement(), np.full(7, 1.6)
+    for k in range(100):
+        late = 0.02 if k > 50 else 0.0
+        assert not agreement.judge(Measurement(fast * (DT * k - late), fast, np.zeros(6), np.zeros(7)), DT)
+
+
 def test_an_arm_that_braked_between_two_late_measurements_is_no_sensor_fault() -> None:
     agreement, moving, still = MotionAgreement(), np.full(7, 0.5), np.zeros(7)
     found = [agreement.judge(Measurement(moving * DT * k, moving, np.zeros(6), still), DT) for k in range(20)]
