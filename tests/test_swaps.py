@@ -25,7 +25,7 @@ def test_a_replayed_camera_gives_the_recorded_run_to_the_last_bit(reference: Fin
     assert finished.report["run_hash"] == reference.report["run_hash"]
 
 
-def test_a_stopped_assessment_is_replaced_in_a_wall_clock_run(tmp_path: Path) -> None:
+def test_a_stopped_camera_is_replaced_in_a_wall_clock_run(tmp_path: Path) -> None:
     words = command("clean", tmp_path, "--wallclock", "--record", "none", "--handover", "100", settings=SHORT)
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     lines: list[str] = []
@@ -33,14 +33,14 @@ def test_a_stopped_assessment_is_replaced_in_a_wall_clock_run(tmp_path: Path) ->
     for line in run.stderr:
         lines.append(line)
         if second is None and "approach" in line.split():
-            service_process(run, "assessment").terminate()
+            service_process(run, "camera").terminate()
             time.sleep(0.5)
-            second = subprocess.Popen([words[0], "takeover", "assessment", "--run", tmp_path.name])
+            second = subprocess.Popen([words[0], "takeover", "camera", "--run", tmp_path.name])
     status = run.wait(timeout=120)
     assert second.wait(timeout=20) == 0
     text = "".join(lines)
     assert status == 0, text
-    assert "another process replaces assessment" in text
+    assert "another process replaces camera" in text
     assert Finished(status, text, tmp_path).report["failure"] is None
 
 

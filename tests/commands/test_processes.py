@@ -237,7 +237,7 @@ def test_a_process_that_joins_is_given_command_and_environment(tmp_path: Path) -
 
 
 def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="robot: only assessment, camera can change hands"):
+    with pytest.raises(UserError, match="robot: only camera can change hands"):
         place_to_take("robot", run(tmp_path, "wallclock"))
     with pytest.raises(UserError, match="in wall-clock runs only"):
         place_to_take("camera", run(tmp_path))

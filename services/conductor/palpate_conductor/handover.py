@@ -1,13 +1,13 @@
 """Slots: in a wall-clock run another process may replace that of a service.
 
-Only for roles whose absence is safe and whose work another process can continue. A run ends without the roles that move the arm,
-measure or supervise, and a perception that did not process the first scan has no surface to continue with.
+Only for the camera, whose absence is safe and whose work another process can continue. A run ends without the roles that move the
+arm, measure or supervise. Perception has the first scan, and the assessment that scan's surface and all samples.
 """
 
 from dataclasses import dataclass, field
 from time import monotonic
 
-REPLACEABLE = frozenset({"camera", "assessment"})
+REPLACEABLE = frozenset({"camera"})
 
 
 @dataclass
