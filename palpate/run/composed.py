@@ -20,8 +20,8 @@ from palpate_bus.runtime.observer import RawRecorder
 from palpate_bus.runtime.process import rare_collections
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings, variable
-from palpate_conductor.collector import Collected, CollectedNews, Collector, FrameTree, collect
-from palpate_conductor.outcome import SIM_LIMIT, Patience, RunProgress, RunResult, Tell, failure_of, incomplete, unsampled
+from palpate_conductor.collector import SIM_LIMIT, Collected, CollectedNews, Collector, FrameTree, collect
+from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, failure_of, incomplete, unsampled
 from palpate_errors import RunError, UserError
 from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
 from palpate_models.scenario.schema import Scenario

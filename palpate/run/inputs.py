@@ -10,7 +10,9 @@ import numpy as np
 from palpate.apart import run_guarded
 from palpate.run.roles import NONE, check_choices, settings_of
 from palpate.truth.pressed import TrueBody, TrueSurface
+from palpate_bus.messages.stamps import NS
 from palpate_bus.settings import Settings
+from palpate_conductor.collector import EXAM_LIMIT
 from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import MeshError
@@ -137,7 +139,8 @@ def check_usable(
 def check_examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
     """Return the scenario after its phantom, its scan and, unless they run `elsewhere`, its arm and services were checked.
 
-    Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service, UserError for an arm.
+    Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service, UserError for an arm
+    and for a scan that takes too long.
     """
     if is_file(pattern := scenario.exam.pattern):  # services have other working directories
         exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
@@ -148,4 +151,7 @@ def check_examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
             from palpate.run.clearance import check_clear  # noqa: PLC0415 - it imports pinocchio
 
             check_clear(scenario)
+    if (needed_s := Outlook.of(scenario.exam).duration_s) > EXAM_LIMIT / NS:
+        text = f"the examination takes {needed_s:.0f} s of simulated time, and {EXAM_LIMIT / NS:.0f} s is the limit"
+        raise UserError(f"{scenario.name}: {text}; reduce exam.region_m or the presses, or increase exam.spacing_m")
     return scenario if elsewhere else check_choices(scenario)

@@ -80,6 +80,7 @@ def test_a_run_that_cannot_be_is_refused(words: str, said: tuple[str, ...], tmp_
     [
         ("run --resume nowhere", "nowhere"),
         ("plan clean --set exam.centre_m=[0.3,0.0]", "lie off the body, the first at"),
+        ("plan clean --set exam.mode=point --set exam.spacing_m=0.004", "s of simulated time, and 3480 s is the limit"),
         ("run --resume . --seed 3", "cannot be combined"),
         ("bench nosuch", "nosuch: no such scenario; known are"),
         ("reproduce --set exam.depth_m=-1", "exam.depth_m"),

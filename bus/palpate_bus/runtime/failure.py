@@ -44,7 +44,7 @@ class FailureCode(StrEnum):
     GAVE_UP = "gave_up"
     """Planning aborted the examination."""
     UNENDED = "unended"
-    """Planning did not end the examination before the limit of simulated time."""
+    """The examination did not end before the limit of simulated time."""
     UNSAMPLED = "unsampled"
     """Targets that planning calls felt were not sampled."""
     UNFINISHED = "unfinished"

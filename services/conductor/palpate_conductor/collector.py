@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 
 from palpate_bus.contract import CONDUCTOR, contract
-from palpate_bus.messages import Clock, DiagnosticArray, ExamState, Quaternion, TFMessage, Transform, TransformStamped, codec
+from palpate_bus.messages import (
+    Clock,
+    DiagnosticArray,
+    ExamState,
+    OperatorRequest,
+    Quaternion,
+    TFMessage,
+    Transform,
+    TransformStamped,
+    codec,
+)
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import MS, NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
@@ -41,7 +51,12 @@ class FrameTree:
 DIAGNOSTICS_PERIOD_NS = NS
 END_AFTER_NS = NS
 """An examination that is over ends the run after this time, whether or not planning announces it."""
+SIM_LIMIT = 3600 * NS
+"""Simulated time [ns] after which a run is ended in any case."""
+EXAM_LIMIT = SIM_LIMIT - 120 * NS
+"""Simulated time [ns] at which planning is asked to end the examination: the arm lifts and goes home before `SIM_LIMIT`."""
 _OVER = frozenset({ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
+_AFTER_CONTACT = frozenset({*_OVER, ExamState.PHASE_RETURN, ExamState.PHASE_ASSESS})
 TF_PERIOD_NS = 50 * MS
 
 
@@ -169,14 +184,14 @@ class Collector(Service):
         self._tf_at = -TF_PERIOD_NS
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Collect new messages; publish the clock, and diagnostics and frames at their periods."""
+        """Collect new messages; publish the clock, diagnostics and frames at their periods; end an examination at its limit."""
         c = self.collected
         states = inbox.new("exam/state")
         self._exam_states.extend(states)
         for state in states:
             if c.end_tick is None and (state.end_tick >= 0 or state.phase in _OVER):
                 c.end_tick = int(state.end_tick) if state.end_tick >= 0 else nanoseconds(state.header.stamp) + END_AFTER_NS
-        seen = inbox.stamp("exam/state")
+        before, seen = c.exam_time, inbox.stamp("exam/state")
         c.exam_time = -1 if seen is None else seen
         self._indentation.extend(inbox.new("truth/indentation"))
         self._motions.extend(inbox.new("perception/motion"))
@@ -193,6 +208,8 @@ class Collector(Service):
         c.correction = inbox.latest("exam/correction")
         c.stiffness_map, c.findings = inbox.latest("assessment/map"), inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}
+        if before < EXAM_LIMIT <= c.exam_time and c.exam_states[-1].phase not in _AFTER_CONTACT:
+            out["operator/request"] = OperatorRequest(header(t), OperatorRequest.END, f"limit of {EXAM_LIMIT / NS:g} s reached")
         if self.diagnose is not None and t - self._diagnostics_at >= DIAGNOSTICS_PERIOD_NS:
             self._diagnostics_at = t
             out["diagnostics"] = DiagnosticArray(header(t), list(self.diagnose()))

@@ -8,14 +8,11 @@ from typing import Any, NamedTuple
 from palpate_bus.contract import CONDUCTOR
 from palpate_bus.messages import NS, ExamState
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_conductor.collector import Collected
+from palpate_conductor.collector import EXAM_LIMIT, SIM_LIMIT, Collected
 from palpate_errors import RunError
 from palpate_models.scenario.schema import Exam
 
 log = logging.getLogger(__name__)
-
-SIM_LIMIT = 3600 * NS
-"""Simulated time [ns] after which a run is ended in any case."""
 
 
 class SamplingLimits(NamedTuple):
@@ -165,10 +162,15 @@ def gave_up(collected: Collected) -> Failure | None:
 
 def incomplete(collected: Collected) -> Failure | None:
     """Return why the examination of a run without failure is not complete; None if it is, or if there was none."""
-    if collected.exam is None or collected.end_tick is not None:
-        return gave_up(collected)
-    text = f"planning did not end the examination: {collected.exam.message or 'without a message'}"
-    return Failure(FailureCode.UNENDED, text, ("planning",), ("exam/state",))
+    exam = collected.exam
+    if exam is None:
+        return None
+    if collected.end_tick is None:
+        text = f"planning did not end the examination: {exam.message or 'without a message'}"
+        return Failure(FailureCode.UNENDED, text, ("planning",), ("exam/state",))
+    if exam.reason == ExamState.REASON_OPERATOR_END and collected.exam_time >= EXAM_LIMIT:
+        return Failure(FailureCode.UNENDED, f"the examination was ended at its limit, {EXAM_LIMIT / NS:g} s of simulated time")
+    return gave_up(collected)
 
 
 def unsampled(collected: Collected, exam: Exam) -> Failure | None:

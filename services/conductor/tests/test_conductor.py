@@ -25,7 +25,7 @@ from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.rmw import Tagger
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 from palpate_conductor import grants
-from palpate_conductor.collector import Collected, Collector, KeptMessages
+from palpate_conductor.collector import EXAM_LIMIT, Collected, Collector, KeptMessages
 from palpate_conductor.conductor import Conductor, conduct
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of, incomplete, unsampled
@@ -65,7 +65,7 @@ def test_kept_messages_equal_the_originals() -> None:
 def test_an_examination_that_is_over_ends_the_run_at_one_tick_even_if_planning_announces_no_end(
     phase: int, announced: int, end: int | None, at_once: int
 ) -> None:
-    collector, inbox = Collector(), mock.Mock()
+    collector, inbox = Collector(), mock.Mock(stamp=lambda topic: 0)
     states = [exam_state(t, phase, end_tick=announced) for t in (50, 60, 70)]
     for k in range(0, len(states), at_once):
         received = {"exam/state": states[k : k + at_once]}
@@ -138,6 +138,22 @@ def test_a_planning_that_never_ends_the_examination_ends_the_run_at_its_limit_in
     assert scanning is not None
     assert (scanning.code, scanning.roles) == (FailureCode.UNENDED, ("planning",))
     assert incomplete(Collected([exam_state(2 * NS, ExamState.PHASE_DONE)], end_tick=2 * NS)) is None
+
+
+@pytest.mark.parametrize(("phase", "asked"), [(ExamState.PHASE_SCAN, True), (ExamState.PHASE_ASSESS, False)])
+def test_an_examination_is_ended_before_the_limit_of_the_run_and_its_report_says_so(phase: int, asked: bool) -> None:
+    collector, inbox = Collector(), mock.Mock()
+    requests = []
+    for t in (EXAM_LIMIT - 10 * MS, EXAM_LIMIT, EXAM_LIMIT + 10 * MS):
+        received = {"exam/state": [exam_state(t, phase)]}
+        inbox.new.side_effect = lambda topic, received=received: received.get(topic, [])
+        inbox.stamp.return_value = t
+        requests.append("operator/request" in collector.step(t, inbox))
+    assert requests == [False, asked, False]
+    ended = exam_state(t, ExamState.PHASE_ABORTED, reason=ExamState.REASON_OPERATOR_END)
+    failure = incomplete(Collected([ended], exam_time=t, end_tick=t))
+    assert failure is not None
+    assert (failure.code, failure.roles) == (FailureCode.UNENDED, ())
 
 
 @pytest.mark.parametrize(

@@ -284,9 +284,9 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
 
 
 def _end(requests: tuple[Message, ...]) -> Cause:
-    """Return the cause if an operator has just ended the examination."""
+    """Return the cause if an operator, or the conductor at its limit, has just ended the examination."""
     ends = [request for request in requests if request.request == request.END]
-    return Cause(Reason.OPERATOR_END, f"ended by the operator: {ends[0].reason}") if ends else NO_CAUSE
+    return Cause(Reason.OPERATOR_END, f"ended on request: {ends[0].reason}") if ends else NO_CAUSE
 
 
 @cache
