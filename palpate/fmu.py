@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from palpate.apart import run_guarded
-from palpate.console import CaseDisplay, SteadyConsole, refuse, wide_console
+from palpate.console import CaseDisplay, SteadyConsole, refuse, table, wide_console
 from palpate.run.options import Settings
 
 if TYPE_CHECKING:
+    from palpate_models.numerics.frames import Array
     from palpate_models.scenario.schema import Scenario
 
 DENSE = 2000
@@ -93,12 +93,12 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     console.print(Text.assemble((description.modelName, "bold"), f" FMI {description.fmiVersion}, {', '.join(kinds)}"))
     console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}")
     console.print(_states(int(description.numberOfContinuousStates or 0)), soft_wrap=True)
-    table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
+    rows = table("variable", "shape", "type", "causality", "unit", "range", "description")
     for v in read_variables(description).values():
         bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"
         shape = " x ".join(map(str, v.shape))
-        table.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
-    wide_console(150).print(table)
+        rows.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
+    wide_console(150).print(rows)
     names = len(description.modelVariables) <= NAMES_CHECKED
     verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
     try:
@@ -122,24 +122,23 @@ def simulate(
     """Press into an abdomen, hold, withdraw, and plot force against depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native
     from palpate_fmu.instance import FmuInstance
-    from palpate_fmu.probing import Probing, plot_probing, probe, run_and_plot, write_csv
+    from palpate_fmu.probing import plot_probing, probe, run_and_plot
     from palpate_fmu.reading import FmuError
 
     console = SteadyConsole(stderr=True)
 
-    def perform() -> tuple[Probing | None, Sequence[str]]:
+    def perform() -> tuple[Array | None, Sequence[str]]:
         with FmuInstance(file) as fmu:
             abdomen = {"indenter_position", "indentation_depth", "normal_force"} <= fmu.variables.keys()
-            probing = probe(fmu, at, depth, speed, hold) if abdomen else None
-        return probing, () if probing else run_and_plot(file, out)
+            rows = probe(fmu, at, depth, speed, hold) if abdomen else None
+        return rows, () if abdomen else run_and_plot(file, out)
 
     try:
-        probing, names = run_guarded(str(file), perform, math.inf)
+        rows, names = run_guarded(str(file), perform, math.inf)
     except FmuError as error:
         refuse(f"{error} (this machine is {native()})")
-    if probing is None:
+    if rows is None:
         console.print(f"{out}: {', '.join(names)}")
         return
-    write_csv(probing, out.with_suffix(".csv"))
-    plot_probing(probing, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
-    console.print(f"{out}: maximum force {probing.force.max():.2f} N at {1e3 * probing.depth.max():.1f} mm")
+    plot_probing(rows, out, f"{file.name} at ({1e3 * at[0]:.0f}, {1e3 * at[1]:.0f}) mm")
+    console.print(f"{out}: maximum force {rows[:, 2].max():.2f} N at {1e3 * rows[:, 1].max():.1f} mm")

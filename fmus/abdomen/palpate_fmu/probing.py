@@ -1,14 +1,13 @@
 """Simulation of an FMU: an abdomen is pressed, held and released along the normal; any other is run as it is and plotted."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_errors import restate
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.reading import FmuError, read_description
+from palpate_fmu.variables import STEP_S
 from palpate_models.numerics.frames import Array
 
 
@@ -39,34 +38,16 @@ def run_and_plot(file: Path, out: Path) -> tuple[str, ...]:
     axes[-1].set_xlabel("time [s]")
     figure.suptitle(description.modelName, parse_math=False)
     figure.savefig(out, dpi=130)
-    columns = np.column_stack([result[name] for name in ("time", *names)])
-    np.savetxt(out.with_suffix(".csv"), columns, fmt="%.17g", delimiter=",", header=",".join(("time", *names)), comments="")
+    _write_csv(out, ",".join(("time", *names)), np.column_stack([result[name] for name in ("time", *names)]))
     return names
+
+
+def _write_csv(out: Path, header: str, rows: Array) -> None:
+    np.savetxt(out.with_suffix(".csv"), rows, fmt="%.17g", delimiter=",", header=header, comments="")
 
 
 GAP_M = 0.002
 """Distance from the surface at which the motion starts and ends."""
-
-
-class Probing(NamedTuple):
-    """Result of a probing motion; all of shape (n,)."""
-
-    time: Array
-    """[s]"""
-    depth: Array
-    """Depth of the sphere's lowest point below the rest surface [m]."""
-    force: Array
-    """On the sphere, along the surface normal [N]."""
-    contacts: NDArray[np.int32]
-    """Vertices in contact."""
-    energy: Array
-    """Stored [J]."""
-
-    def table(self) -> Array:
-        """Return the columns of the reference results, shape (n, 5)."""
-        return np.column_stack((self.time, self.depth, self.force, self.contacts, self.energy))
-
-
 COLUMNS = "time [s],indentation_depth [m],normal_force [N],contacts,elastic_energy [J]"
 
 
@@ -76,10 +57,8 @@ def probe(
     depth_m: float = 0.010,
     speed_mps: float = 0.02,
     hold_s: float = 1.0,
-    step_s: float = 1e-3,
-    start_s: float = 0.0,
-) -> Probing:
-    """Press at a point (x, y) of the abdomen frame [m] to a depth, hold it and withdraw, from `start_s` on.
+) -> Array:
+    """Press at a point (x, y) of the abdomen frame [m] to a depth, hold it and withdraw; return `COLUMNS`, shape (n, 5).
 
     The FMU must be fresh. Its sphere moves along the normal of the rest surface beneath (x, y, 0.05 m).
     """
@@ -94,10 +73,10 @@ def probe(
     place.pull()
     point, normal = place["surface_point"].copy(), place["surface_normal"].copy()
     way = (depth_m + GAP_M) / speed_mps
-    steps = round((2 * way + hold_s) / step_s)
+    steps = round((2 * way + hold_s) / STEP_S)
     rows = np.empty((steps, 5))
     for k in range(steps):
-        t = (k + 1) * step_s
+        t = (k + 1) * STEP_S
         if t < way:
             depth, rate = speed_mps * t - GAP_M, speed_mps
         elif t < way + hold_s:
@@ -107,21 +86,22 @@ def probe(
         position[:] = point + (radius - depth) * normal
         velocity[:] = -rate * normal
         motion.push()
-        fmu.step(start_s + k * step_s, step_s)
-        rows[k] = (start_s + t, *result.pull()[:2], int(counter.pull()[0]), result.values[2])
-    return Probing(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3].astype(np.int32), rows[:, 4])
+        fmu.step(k * STEP_S, STEP_S)
+        rows[k] = (t, *result.pull()[:2], int(counter.pull()[0]), result.values[2])
+    return rows
 
 
-def plot_probing(probing: Probing, out: Path, title: str) -> None:
-    """Force against depth, and force over time, as a PNG."""
+def plot_probing(rows: Array, out: Path, title: str) -> None:
+    """Write force against depth, and both over time, as a PNG, and all columns of `probe` as a CSV of the same name."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (slow to import)
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.plot(1e3 * probing.depth, probing.force, color="#1f5fa8")
+    time, depth, force = rows.T[:3]
+    left.plot(1e3 * depth, force, color="#1f5fa8")
     left.set(xlabel="indentation depth [mm]", ylabel="normal force [N]", title="force against depth")
-    right.plot(probing.time, probing.force, color="#1f5fa8", label="normal force [N]")
-    right.plot(probing.time, 1e3 * probing.depth, color="#888888", linewidth=1, label="depth [mm]")
+    right.plot(time, force, color="#1f5fa8", label="normal force [N]")
+    right.plot(time, 1e3 * depth, color="#888888", linewidth=1, label="depth [mm]")
     right.set(xlabel="time [s]", title="press, hold, withdraw")
     right.legend(frameon=False)
     for axes in (left, right):
@@ -129,8 +109,4 @@ def plot_probing(probing: Probing, out: Path, title: str) -> None:
         axes.axhline(0, color="#cccccc", linewidth=0.8, zorder=0)
     figure.suptitle(title)
     figure.savefig(out, dpi=130)
-
-
-def write_csv(probing: Probing, out: Path) -> None:
-    """The columns as text, exact."""
-    np.savetxt(out, probing.table(), fmt="%.17g", delimiter=",", header=COLUMNS, comments="")
+    _write_csv(out, COLUMNS, rows)

@@ -10,6 +10,8 @@ from enum import StrEnum
 from math import prod
 from typing import Any, NamedTuple
 
+STEP_S = 1e-3
+"""The step size a master should take."""
 LESIONS = 8
 """Maximum number of lesions of an FMU."""
 BRANCHES = 4

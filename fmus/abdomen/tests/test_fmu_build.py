@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 
 from palpate.commands import app_for
 from palpate_fmu.compiling import WARNINGS, native, platforms
-from palpate_fmu.export import build_fmu, write_sources
+from palpate_fmu.export import ExportError, build_fmu, sizes_of, start_values, write_sources
 from palpate_fmu.instance import FmuInstance
-from palpate_fmu.phantom_file import ExportError, sizes_of, start_values
 from palpate_fmu.probing import probe
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
@@ -57,7 +56,7 @@ def test_the_sources_in_the_fmu_build_with_another_compiler(fmu2: Path, tmp_path
     subprocess.run(command, cwd=folder / "sources", check=True)
     rebuilt = Path(shutil.make_archive(str(tmp_path / "rebuilt"), "zip", folder))
     with FmuInstance(rebuilt) as theirs, FmuInstance(fmu2) as ours:
-        found, expected = probe(theirs, hold_s=0.1).table(), probe(ours, hold_s=0.1).table()
+        found, expected = probe(theirs, hold_s=0.1), probe(ours, hold_s=0.1)
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
 

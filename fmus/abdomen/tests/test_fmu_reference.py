@@ -15,14 +15,14 @@ from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.schema import Phantom
 
 REFERENCE = Path(__file__).parents[1] / "reference" / "probing.csv"
-"""A probing motion on the fixtures' phantom, every tenth row. Written by write_csv, rows thinned, when equations change."""
+"""A probing motion on the fixtures' phantom, every tenth row. Written by plot_probing, rows thinned, when equations change."""
 
 
 def test_probing_gives_the_reference_results(fmu: Path) -> None:
     assert REFERENCE.read_text(encoding="utf-8").splitlines()[0] == COLUMNS
     expected = np.loadtxt(REFERENCE, delimiter=",", skiprows=1)
     with FmuInstance(fmu) as instance:
-        found = probe(instance, at_m=(-0.05, -0.05), hold_s=0.5).table()[::10]
+        found = probe(instance, at_m=(-0.05, -0.05), hold_s=0.5)[::10]
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
     assert expected[:, 2].max() > 3
