@@ -15,8 +15,7 @@ from palpate.quick.errors import Loop, loop_errors
 from palpate.quick.examination import QuickExamination
 from palpate.quick.felt import FeltPatient, felt_patient
 from palpate.search.environment import ID, SearchEnv
-from palpate.search.hand import Hand, PatientHand, SurrogateHand
-from palpate.search.trial import case, search
+from palpate.search.trial import Hand, PatientHand, SurrogateHand, case, search
 from palpate_models.scenario.schema import Scenario
 from palpate_search.posterior import policy
 from research.search.whole import summary

@@ -111,8 +111,7 @@ final.findings
 # second. This patient breathes, and the equipment has errors.
 
 # %%
-from palpate.search.hand import PatientHand  # noqa: E402
-from palpate.search.trial import search  # noqa: E402
+from palpate.search.trial import PatientHand, search  # noqa: E402
 from palpate_search.posterior import policy  # noqa: E402
 
 trial = search(PatientHand(palpate.scenario("lump", seed=7)), policy("informed"), presses=20)

@@ -33,7 +33,7 @@ def compare(
     from json import dumps
 
     from palpate.comparison import compare as comparing
-    from palpate.comparison.outcomes import draw_outcomes, read_outcomes, sim_to_real
+    from palpate.comparison.compare import draw_outcomes, read_outcomes, sim_to_real
     from palpate.report.files import write_text
 
     if b is None:

@@ -21,8 +21,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.trial import SearchCase, case
+from palpate.search.trial import PatientHand, SearchCase, SurrogateHand, case
 from palpate_models.numerics.frames import Array
 from palpate_search.posterior import LAYERS, Posterior, maps, shape
 from palpate_search.presses import Budget, Task, press_duration

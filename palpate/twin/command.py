@@ -33,7 +33,7 @@ def fit(
     from palpate.recording.read import read_recording
     from palpate.report.evidence import map_of
     from palpate.report.files import write_text
-    from palpate.twin.scenario import write_twin
+    from palpate.twin.fit import write_twin
 
     read = read_recording(recording, mapping)
     for fault in read.faults:

@@ -11,8 +11,7 @@ import numpy as np
 import typer
 from rich.progress import track
 
-from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.trial import case
+from palpate.search.trial import PatientHand, SurrogateHand, case
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 

@@ -9,8 +9,7 @@ import typer
 from matplotlib.animation import PillowWriter
 
 from palpate.interface.scenarios import scenario
-from palpate.search.hand import PatientHand
-from palpate.search.trial import search
+from palpate.search.trial import PatientHand, search
 from palpate_models.numerics.frames import Array
 from palpate_search.posterior import Posterior, policy
 from palpate_search.presses import Budget

@@ -12,8 +12,7 @@ from rich.progress import track
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
-from palpate.search.hand import SurrogateHand
-from palpate.search.trial import case, search
+from palpate.search.trial import SurrogateHand, case, search
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import field_covariances
 from palpate_assessment.standard import LENGTHS, USUAL

@@ -14,8 +14,7 @@ import pandas as pd
 import typer
 from rich.progress import track
 
-from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.trial import case, search
+from palpate.search.trial import PatientHand, SurrogateHand, case, search
 from palpate_search.posterior import POLICY, policy
 
 HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.comparison.compare import ComparedPalpation, compare, draw
-from palpate.comparison.outcomes import read_outcomes, sim_to_real
+from palpate.comparison.compare import ComparedPalpation, compare, draw, read_outcomes, sim_to_real
 from palpate.report.scoring import Map
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, matrix

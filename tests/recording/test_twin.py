@@ -8,8 +8,7 @@ import pytest
 
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.scoring import Map
-from palpate.twin.fit import presses_of, simulate
-from palpate.twin.scenario import write_twin
+from palpate.twin.fit import presses_of, simulate, write_twin
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import build_phantom, flat_phantom
