@@ -44,7 +44,7 @@ GROUPS = {
         "doctor": "palpate.live.doctor:doctor",
         "topics": "palpate.listings:topics",
         "topic": "palpate.live.topic:app",
-        "node": "palpate.live.graph:app",
+        "node": "palpate.live.bus:app",
     },
     "Replace a part, or run in several places": {
         "arm": "palpate.arm.command:app",

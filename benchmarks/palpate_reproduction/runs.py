@@ -8,8 +8,7 @@ from pathlib import Path
 from time import sleep
 from typing import Final, NamedTuple
 
-from palpate.live.bus import join_bus
-from palpate.live.graph import present
+from palpate.live.bus import join_bus, present
 from palpate.live.topic import topic_rows
 from palpate.report.archive import read_completed
 from palpate_bus.runs.announcement import Run, live_runs

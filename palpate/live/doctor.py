@@ -14,8 +14,7 @@ from rich.filesize import decimal
 from rich.text import Text
 
 from palpate.console import SteadyConsole, number, print_json, print_line, table, wide_console
-from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, join_bus
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, join_bus, missing
 from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.monitor import LiveMonitor
@@ -156,7 +155,7 @@ def _clock(live: LiveMonitor) -> Iterator[Remark]:
 def _who(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
     """Report missing and unknown roles, and which share a process."""
     roles, alive = contract().roles, live.graph.alive.values()
-    absent = graph.missing(contract(), alive, bus.target.run)
+    absent = missing(contract(), alive, bus.target.run)
     workers = [role for role in absent if not roles[role].observer]
     yield from (Remark("roles", Severity.BAD, f"{role} is missing: {roles[role].doc}") for role in workers)
     if not workers:

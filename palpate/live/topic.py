@@ -16,8 +16,7 @@ from rich.filesize import decimal
 from rich.text import Text
 
 from palpate.console import print_json, print_line, say, table, wide_console
-from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, ends, join_bus, present
 from palpate.run.options import takes
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec, nanoseconds
@@ -52,7 +51,7 @@ Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
     with join_bus(connect, run, domain) as bus:
-        rows = topic_rows(graph.present(bus))
+        rows = topic_rows(present(bus))
     if as_json:
         print_json(rows)
         return
@@ -72,7 +71,7 @@ def topic_rows(found: Sequence[Entity]) -> list[dict[str, Any]]:
     """Return a row per topic, sorted: its types with their hashes, of which more than one is a mismatch, and its nodes."""
     rows: dict[str, dict[str, Any]] = {}
     for side, kind in (("publishers", EntityKind.PUBLISHER), ("subscribers", EntityKind.SUBSCRIPTION)):
-        for node, end in graph.ends(found, kind):
+        for node, end in ends(found, kind):
             row = rows.setdefault(end.topic, {"topic": end.topic, "types": set(), "publishers": [], "subscribers": []})
             row["types"].add((end.type, end.type_hash))
             row[side] = sorted([*row[side], node])
@@ -89,14 +88,14 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
     """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
     name = name.strip("/")
     with join_bus(connect, run, domain) as bus:
-        found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
+        found = [e for e in present(bus) if e.endpoint is not None and e.endpoint.topic == name]
     row = contract().topics.get(name)
     if not found and row is None:
         raise _unknown(name)
-    ends = [(entity, entity.endpoint) for entity in found if entity.endpoint is not None]
+    there = [(entity, entity.endpoint) for entity in found if entity.endpoint is not None]
     if as_json:
-        nodes = [{"node": entity.node, "kind": entity.kind.name.lower()} for entity, _ in ends]
-        kinds = [{"type": end.type, "hash": end.type_hash, "qos": end.qos} for _, end in ends]
+        nodes = [{"node": entity.node, "kind": entity.kind.name.lower()} for entity, _ in there]
+        kinds = [{"type": end.type, "hash": end.type_hash, "qos": end.qos} for _, end in there]
         endpoints = [node | kind for node, kind in zip(nodes, kinds, strict=True)]
         print_json({"topic": name, "contract": None if row is None else row.model_dump(mode="json"), "endpoints": endpoints})
         return
@@ -106,7 +105,7 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
     for key, value in about:
         out.add_row(Text(key, "bold"), value)
     ends_table = table("node", "", "type", "hash")
-    for entity, end in ends:
+    for entity, end in there:
         same = row is None or (end.type, end.type_hash) == (row.type, row.type_hash)
         shown = Text(f"{end.type_hash[:24]}…") if same else Text(f"{end.type_hash[:24]}… differs", "bold red")
         ends_table.add_row(entity.node, entity.kind.name.lower(), end.type, shown)
@@ -214,7 +213,7 @@ def _subscribe(options: StreamOptions) -> Iterator[tuple[Topic, Subscription]]:
         name = options.name.strip("/")
         row = contract().topics.get(name)
         if row is None:
-            found = graph.ends(graph.present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+            found = ends(present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
             live = [end.type for _, end in found if end.topic == name]
             if not live:
                 raise _unknown(name)

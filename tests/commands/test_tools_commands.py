@@ -17,8 +17,8 @@ import zenoh
 from typer.testing import CliRunner, Result
 
 from palpate.console import CommandGroup
+from palpate.live.bus import app as node, missing
 from palpate.live.doctor import doctor
-from palpate.live.graph import app as node, missing
 from palpate.live.topic import app as topic
 from palpate_bus.contract import contract
 from palpate_bus.messages import MS, JointState, String, Vector3, Wrench, WrenchStamped, codec, header
