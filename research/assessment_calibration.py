@@ -31,7 +31,7 @@ from palpate.quick.case import assess, examine_quickly
 from palpate.report.results import truth_of_run
 from palpate.report.scoring import Truth
 from palpate.study.statistics.estimate import LEVEL, Estimate
-from palpate.truth.felt import PALPABLE
+from palpate.truth.pressed import PALPABLE
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.detection import FEATURES, FELT, STRUCTURES, SURE, Candidate

@@ -25,8 +25,7 @@ from palpate.report.evidence import map_of
 from palpate.report.results import truth_of_run
 from palpate.report.rows import Report
 from palpate.report.scoring import Map
-from palpate.truth.felt import Felt
-from palpate.truth.pressed import Touched
+from palpate.truth.pressed import Felt, Touched
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario

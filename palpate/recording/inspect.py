@@ -9,23 +9,12 @@ import pandas as pd
 import yaml
 from matplotlib.figure import Figure
 
+from palpate.recording import readings as sources
+from palpate.recording.contacts import probes
 from palpate.recording.mapping import SCALES, ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tare
-from palpate.recording.probes import probes
 from palpate.recording.read import LIMITS, clean_readings, recording_of
-from palpate.recording.readings import (
-    KINDS,
-    TABLES,
-    ReadingError,
-    Readings,
-    from_bag,
-    from_table,
-    is_date,
-    move_to_mapped,
-    numbers_of,
-    open_bag,
-    read_table,
-)
+from palpate.recording.readings import KINDS, ReadingError, Readings
 from palpate.recording.recording import implied_young
 from palpate.report.files import write_text
 from palpate_errors import UserError
@@ -48,13 +37,13 @@ _UNIT: Final = re.compile(r"([_ ]*[\[(]|[_ ]+|(?<=[xyzXYZ]))(mm|cm|mN|kgf|gf|lbf
 def propose(path: Path, out: Path) -> list[str]:
     """Write a mapping of a recording to `out`, and a picture next to it; return lines for the user. Raises UserError."""
     lines: list[str] = []
-    if path.suffix in TABLES:
-        table = read_table(path)
+    if path.suffix in sources.TABLES:
+        table = sources.read_table(path)
         mapping = _of_table(table, str(path), lines)
-        raw = from_table(table, mapping, str(path))
+        raw = sources.from_table(table, mapping, str(path))
     else:
         mapping = _of_bag(path, lines)
-        raw = from_bag(path, mapping)
+        raw = sources.from_bag(path, mapping)
     clean = clean_readings(raw, _UNKNOWN_RADIUS_M)[0]
     mapping, axis = _with_force(mapping, clean, lines)
     lines.append(f"not sure: tool.radius_m: {_UNKNOWN_RADIUS_M} is a guess; measure the ball")
@@ -63,7 +52,7 @@ def propose(path: Path, out: Path) -> list[str]:
     text = yaml.safe_dump(mapping.model_dump(mode="json", exclude_defaults=True), sort_keys=False, default_flow_style=None)
     write_text(out, f"# Proposed for {path.name}.\n" + "".join(f"# {line}\n" for line in lines) + text)
     picture = out.with_suffix(".png")
-    _draw(picture, move_to_mapped(clean, mapping), axis)
+    _draw(picture, sources.move_to_mapped(clean, mapping), axis)
     return [*lines, f"to check: {out}, and the picture {picture}"]
 
 
@@ -143,9 +132,9 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
     lines.append(f"{'sure' if span > 10 or span < 1 else 'not sure'}: lengths in {length}: the positions span {span:.3g}")
     unit = "s"
     if time:
-        step = float(np.nanmedian(np.diff(numbers_of(table[time]))))
+        step = float(np.nanmedian(np.diff(sources.numbers_of(table[time]))))
         unit = "ns" if step > 1e5 else "us" if step > 500 else "ms" if step > 0.9 else "s"
-        unit = named[2] if named[2] in ("s", "ms", "us", "ns") and not is_date(table[time]) else unit
+        unit = named[2] if named[2] in ("s", "ms", "us", "ns") and not sources.is_date(table[time]) else unit
         lines.append(f"{'not sure' if 0.2 < step < 5 and not named[2] else 'sure'}: time in {unit}: a row every {step:.3g}")
     force_unit = named[1] if named[1] in ("N", "mN", "gf", "kgf", "lbf") else "N"
     lines.append(f"sure: force in {force_unit}" if named[1] == force_unit else "not sure: units.force: N; the table has no unit")
@@ -163,7 +152,7 @@ def _four(names: list[str], letters: str) -> tuple[str, str, str, str] | None:
 
 
 def _of_bag(path: Path, lines: list[str]) -> Mapping:
-    with open_bag(path) as bag:
+    with sources.open_bag(path) as bag:
         topics = {kind: sorted({c.topic for c in bag.connections if c.msgtype == name}) for kind, name in KINDS.items()}
         frames = _frames(bag) if not topics["pose"] and topics["tf"] else ([], [])
     if not topics["wrench"]:
@@ -203,7 +192,7 @@ def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapp
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
         candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})
-        readings = move_to_mapped(raw, candidate)
+        readings = sources.move_to_mapped(raw, candidate)
         axis = pressing_axis(readings.position, readings.force, probes(readings) if raw.time is None else blocks(raw.time))
         if axis is not None:
             tried.append((axis.angle_deg, candidate, readings, axis))

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.report.scoring import Map, Truth
-from palpate.truth.felt import Felt
-from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Felt, Pressed, Touched, TrueBody, TrueSurface
 from palpate_bus.messages import NS, StiffnessMap, nanoseconds
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_models.numerics.frames import Array, apply, inverse

@@ -17,8 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import Delaunay
 
 from palpate.report.rows import FindingRow, FindingScore, Scores
-from palpate.truth.felt import Felt, Lump
-from palpate.truth.pressed import Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Felt, Lump, Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, Mask, apply
 
 MATCHING_DICE: Final = 0.3

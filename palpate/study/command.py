@@ -5,22 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from palpate.console import CaseDisplay, SteadyConsole, fail, output_folder, refuse
+from palpate.console import CaseDisplay, SteadyConsole, fail, output_folder, refuse, table
 from palpate.run.options import ServiceChoices, Settings
 from palpate_errors import ExitStatus
 
 if TYPE_CHECKING:
     from palpate.study.cases import Case
     from palpate.study.folder import Folder, Manifest, RunRecord
-    from palpate.study.spec import Split, Study
+    from palpate.study.spec import Study
 
-SPLITS = ("tune", "test", "shift")
+Split = Literal["tune", "test", "shift"]
 SHOWN = 10
 """Maximum number of incomplete cases that are listed."""
 
@@ -42,18 +41,18 @@ def list_studies() -> None:
     """List the studies that come with Palpate."""
     from palpate.study.spec import load_study, study_names
 
-    table = Table("study", "tier", "cases of the split test", "description", box=None)
+    rows = table("study", "tier", "cases of the split test", "description")
     for name in study_names():
         study = load_study(name)
         patients = sum(population.number.test for population in study.populations.values())
-        table.add_row(name, study.tier, str(patients * len(study.methods) * len(study.error_levels())), study.description)
-    SteadyConsole().print(table)
+        rows.add_row(name, study.tier, str(patients * len(study.methods) * len(study.error_levels())), study.description)
+    SteadyConsole().print(rows)
 
 
 @app.command()
 def run(  # noqa: PLR0913 - the options of a command
     name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A study (see `palpate study list`) or a YAML file.")],
-    split: Annotated[str, typer.Option(help="tune: to choose thresholds; test: to report; shift: other patients.")] = "test",
+    split: Annotated[Split, typer.Option(help="tune: to choose thresholds; test: to report; shift: other patients.")] = "test",
     number: Annotated[int | None, typer.Option(min=1, help="Patients of each population, instead of the study's own.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Cases at a time on this machine; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")] = None,
@@ -86,8 +85,6 @@ def run(  # noqa: PLR0913 - the options of a command
 
       palpate study release --shard 2/5 -o part2              the second of five parts; then: palpate study merge part*
     """
-    if split not in SPLITS:
-        raise typer.BadParameter(f"--split {split}: expected one of {', '.join(SPLITS)}")
     if shard and scheduler:
         refuse("--shard and --scheduler cannot be combined")
     from palpate.study.cases import Request, cases_of, command_of, secret_of
@@ -98,7 +95,7 @@ def run(  # noqa: PLR0913 - the options of a command
     console = SteadyConsole(stderr=True, quiet=quiet)
     study = _choose(load_study(name), method, services)
     secret = None if seeds_file is None else secret_of(seeds_file, study)
-    request = Request(cast("Split", split), number, settings or (), secret)
+    request = Request(split, number, settings or (), secret)
     cases = cases_of(study, request)
     own = select_shard(cases, shard) if shard else cases
     path = out or default_folder(study.name, split)

@@ -16,8 +16,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
 from palpate.study.statistics.accuracy import Agreement, FindingCalibration
-from palpate.study.statistics.analysis import MethodRow
-from palpate.study.statistics.comparison import QUANTITIES
+from palpate.study.statistics.comparison import QUANTITIES, MethodRow
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, MADE, Surface
 from palpate.study.statistics.detection import GRID as ROC_GRID, RATES
 from palpate.study.statistics.estimate import Estimate

@@ -16,8 +16,7 @@ from palpate.report.files import write_text
 from palpate.report.rows import Report
 from palpate.study.folder import RUN, Folder, Manifest, Outcome, RunRecord, record
 from palpate.study.page import HUMANS, render
-from palpate.study.statistics.analysis import MethodRow, analyse
-from palpate.study.statistics.comparison import Comparison, compare
+from palpate.study.statistics.comparison import Comparison, MethodRow, analyse, compare
 from palpate.study.statistics.estimate import FOLDS, LEVEL, Row
 from palpate.study.statistics.reading import read_tables
 from palpate_errors import UserError

@@ -10,8 +10,7 @@ import pytest
 from palpate.report import scoring
 from palpate.report.rows import FindingRow, Scores
 from palpate.report.scoring import Map, Truth
-from palpate.truth.felt import Felt
-from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Felt, Pressed, Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam
 

@@ -1,7 +1,6 @@
 """Accuracy of findings: errors of position, size and stiffness (Bland and Altman), calibration of confidences, and effort."""
 
 from typing import Final, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from sklearn.metrics import brier_score_loss
 from palpate.study.statistics.detectability import fit
 from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Drawn, Estimate, Row, estimate
 from palpate.study.statistics.reading import Variant
+from palpate_models.numerics.seeds import generator
 
 NORMAL: Final = 1.959964
 """Between -NORMAL and NORMAL lie 95 % of a standard normal variable."""
@@ -221,8 +221,7 @@ def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], d
 
 
 def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([0, crc32(b"hits by their confidence")])))
-    hit = rng.random((FOLDS, len(p))) < p
+    hit = generator(0, "hits by their confidence").random((FOLDS, len(p))) < p
     return float(np.quantile(_expected_error(p, hit, label, np.ones((1, len(p)))), LEVEL))
 
 

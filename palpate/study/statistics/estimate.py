@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from math import isfinite
 from typing import Any, Final, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from statsmodels.stats.proportion import proportion_confint
+
+from palpate_models.numerics.seeds import generator
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ class Bootstrap(NamedTuple):
     @staticmethod
     def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> "Bootstrap":
         """Draw the resamplings; `populations`: population of each patient, shape (patients,)."""
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"bootstrap over patients")])))
+        rng = generator(seed, "bootstrap over patients")
         names = np.asarray(populations)
         counts = np.zeros((folds, len(names)), dtype=np.int32)
         for name in np.unique(names):
@@ -124,8 +125,6 @@ def estimate(value: float, replicates: Array, n: int, of: str, degenerate: Calla
 
 def bound(value: float, replicates: Array, n: int, of: str, patients: int) -> Estimate:
     """Return a figure between 0 and 1 with its bootstrap interval; at 0 or 1 with Wilson's, with one trial per patient."""
-    if not isfinite(value):
-        return Estimate(value=None, n=n, of=of)
 
     def at_the_end() -> Estimate:
         ends = wilson(value * patients, patients, "patients")
