@@ -73,7 +73,6 @@ class LiveRig(Rig):
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
         self._last_control = 0.0
-        self.ready = False
         self.finished = False
         self.facts: dict[str, Any] = {}
         """Facts that the implementation reported at its end."""
@@ -117,10 +116,10 @@ class LiveRig(Rig):
             for message in self._receive_reports():
                 if message.state == ServiceReport.READY:
                     missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
-        self.ready = missing == []
+        ready = missing == []
         got = "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
-        got = "READY" if self.ready else got
-        self.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
+        got = "READY" if ready else got
+        self.expect("answers the conductor's hello", ready, "a ServiceReport READY with nothing missing", got)
 
     def _check_graph(self) -> None:
         self.graph.changes()
@@ -256,10 +255,8 @@ def start_implementation(command: str | None, role: str, settings: RigSettings, 
         view = view_of(role)
         file = Path(folder) / f"{view}.yaml"
         file.write_text(dump_scenario(settings.scenario, view), encoding="utf-8")
-        environment = {
-            **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
-            "PALPATE_OUT": folder, "PALPATE_RECORD": "none", "ROS_DOMAIN_ID": str(domain),
-        }  # fmt: skip
+        given = {"router": endpoint, "scenario": file, "out": folder, "domain": domain}
+        environment = os.environ | Settings.read().replace(runtime="wallclock", record="none", **given).to_env()
         split = shlex.split(command)
         with restate(OSError, NoBusError, f"--start {command}"):
             child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)

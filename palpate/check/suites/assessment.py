@@ -25,15 +25,16 @@ class Belly(NamedTuple):
     """Force at the depth of the scan on unremarkable tissue."""
 
 
-class ScanSettings(NamedTuple):
-    """The played scan and the wait for findings."""
+BELLY = Belly()
+SPEED_MPS, SPACING_M = 0.03, 0.0125
+"""Of the played scan."""
+ANSWER_S = 30.0
+"""Wait for findings."""
 
-    speed_mps: float = 0.03
-    spacing_m: float = 0.0125
-    answer_s: float = 30.0
 
-
-BELLY, SCAN = Belly(), ScanSettings()
+def stiffness(r: float) -> float:
+    """Return the stiffness at a distance [m] from the middle of the stiff area, relative to unremarkable tissue."""
+    return 1.0 + (BELLY.contrast - 1.0) / (1.0 + float(np.exp((r - BELLY.stiff_radius_m) / 0.004)))
 
 
 class PlayedScan:
@@ -41,8 +42,8 @@ class PlayedScan:
 
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
         self._X_WA, self._depth, self._start = X_WA, depth, start
-        line = np.arange(-half, half, SCAN.speed_mps * 0.01)
-        rows = enumerate(np.arange(-half, half + 1e-9, SCAN.spacing_m))
+        line = np.arange(-half, half, SPEED_MPS * 0.01)
+        rows = enumerate(np.arange(-half, half + 1e-9, SPACING_M))
         self.path = np.vstack([np.column_stack((line[::-1] if i % 2 else line, np.full(len(line), y))) for i, y in rows])
         self.duration = len(self.path) * 0.01 + 1.0
 
@@ -56,15 +57,10 @@ class PlayedScan:
         n_A = shapes.normals(np.array([x]), np.array([y]))
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
         depth = float(sense(self._depth, t)) if scanning else -0.01
-        force = BELLY.force_n * self.stiffness(x, y) if scanning else 0.0
+        off = float(np.hypot(x - BELLY.stiff_at_m[0], y - BELLY.stiff_at_m[1]))
+        force = BELLY.force_n * stiffness(off) if scanning else 0.0
         felt = {"depth_setpoint": self._depth, "depth": depth, "normal_force": force, "depth_uncertainty": 0.0005}
         return exam_state(t, phase, p_W, n_W, target_count=1, in_contact=scanning, steady=scanning, stroke=1, **felt)
-
-    @staticmethod
-    def stiffness(x: float, y: float) -> float:
-        """Return the stiffness relative to unremarkable tissue."""
-        r = float(np.hypot(x - BELLY.stiff_at_m[0], y - BELLY.stiff_at_m[1]))
-        return 1.0 + (BELLY.contrast - 1.0) / (1.0 + float(np.exp((r - BELLY.stiff_radius_m) / 0.004)))
 
 
 def suite(rig: Rig) -> None:
@@ -99,7 +95,7 @@ def _samples(rig: Rig, half: float) -> None:
 
 def _findings(rig: Rig, play: PlayedScan) -> None:
     rig.section("findings")
-    answer = rig.await_message(FINDINGS, SCAN.answer_s, {"exam/state": play.state})
+    answer = rig.await_message(FINDINGS, ANSWER_S, {"exam/state": play.state})
     final = [item.message for item in answer if item.message.final]
     if not rig.equal("final findings once", len(final), 1):
         return

@@ -1,29 +1,17 @@
 """Role search: the suite plays an examination that carries out each request, on a belly with one stiff area."""
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from palpate.check.rig import Rig
+from palpate.check.suites.assessment import BELLY, stiffness
 from palpate.exam_state import exam_state
 from palpate_bus.messages import ExamState, Message, PalpationSample, Point, SearchRequest, Vector3, header
 
 REQUEST: Final = "exam/request"
 PRESS_S: Final = 0.3
 MAX_PRESSES: Final = 40
-
-
-class SoftBelly(NamedTuple):
-    """A belly with one stiff area."""
-
-    stiff_radius_m: float = 0.020
-    edge_m: float = 0.007
-    contrast: float = 3.0
-    force_n: float = 4.0
-    """Force at 10 mm depth on unremarkable tissue."""
-
-
-BELLY: Final = SoftBelly()
 
 
 class Play:
@@ -79,8 +67,7 @@ def suite(rig: Rig) -> None:
 def press_belly(t: int, asked: Any, stiff_at: Any) -> Message:
     """Return the sample of a press of the belly."""
     xy = np.array((asked.place.x, asked.place.y))
-    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - BELLY.stiff_radius_m) / BELLY.edge_m)))
-    force = BELLY.force_n * BELLY.contrast**bump * (asked.depth / 0.010) ** 1.3
+    force = BELLY.force_n * stiffness(float(np.linalg.norm(xy - stiff_at))) * (asked.depth / 0.010) ** 1.3
     place = Point(float(xy[0]), float(xy[1]), 0.0)
     up = Vector3(0.0, 0.0, 1.0)
     return PalpationSample(header(t, "abdomen"), place, up, float(asked.depth), float(force), 0.0, 0.5, False, 1, 0.0005)
