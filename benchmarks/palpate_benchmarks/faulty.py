@@ -110,10 +110,6 @@ class FaultySender:
         """Send the empty message that tests the edge; the fault does not affect it."""
         self._sender.hello()
 
-    def close(self) -> None:
-        """Undeclare the sender."""
-        self._sender.close()
-
 
 def _corrupt(payload: bytes, topic: Topic) -> bytes:
     begin = len(payload) // 2

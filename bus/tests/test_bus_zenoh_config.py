@@ -12,7 +12,7 @@ import pytest
 import zenoh
 from waiting import wait_until
 
-from palpate_bus.contract import parse, with_periods
+from palpate_bus.contract import parse
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session, session, zenoh_config
 
@@ -191,9 +191,9 @@ TEXT = resources.files("palpate_bus.contract").joinpath("contract.yaml").read_te
 
 
 def test_a_slower_role_sends_at_each_of_its_steps_and_nothing_else_changes() -> None:
-    usual, slow = parse(TEXT), parse(with_periods(TEXT, {"control": 5}))
+    usual, slow = parse(TEXT), parse(TEXT, {"control": 5})
     assert slow.roles["control"].period_ms == slow.topics["control/joint_torque"].period_ms == 5
     assert all(slow.topics[name] == row for name, row in usual.topics.items() if row.producer != "control")
-    assert parse(with_periods(TEXT, {"control": 1})) == usual
+    assert parse(TEXT, {"control": 1}) == usual
     with pytest.raises(ValueError, match="PALPATE_PERIODS: unknown role 'controller'"):
-        with_periods(TEXT, {"controller": 5})
+        parse(TEXT, {"controller": 5})

@@ -23,8 +23,8 @@ from palpate.run.self_test import RATES, TimingResult
 from palpate.study.spec import load_study
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run
+from palpate_bus.runtime.composed import Group
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_bus.runtime.group import Group
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.contract.rows import Topic
+from palpate_bus.contract import Topic
 from palpate_bus.messages import Message, nanoseconds
 from palpate_bus.messages.codec import message_type, store
 from palpate_bus.messages.fields import LeafField, leaves, numbers

@@ -10,25 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palpate_bus.messages import (
-    CameraInfo,
-    Header,
-    Image,
-    Point,
-    PointCloud2,
-    PointField,
-    Pose,
-    Quaternion,
-    RegionOfInterest,
-    SurfaceMesh,
-    TFMessage,
-    ToolState,
-    Transform,
-    TransformStamped,
-    Twist,
-    Vector3,
-    Wrench,
-)
+from palpate_bus import messages as ros
 
 Array = NDArray[np.float64]
 
@@ -70,7 +52,7 @@ def quaternion(R: Array) -> tuple[float, float, float, float]:
     return x / norm, y / norm, z / norm, w / norm
 
 
-def rotation(orientation: Quaternion) -> Array:
+def rotation(orientation: ros.Quaternion) -> Array:
     """Return the rotation matrix, shape (3, 3). Raises ValueError if the quaternion's norm is off by 1 % or more."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     norm = sqrt(x * x + y * y + z * z + w * w)
@@ -84,17 +66,17 @@ def rotation(orientation: Quaternion) -> Array:
     ])  # fmt: skip
 
 
-def pose_matrix(message: Pose) -> Array:
+def pose_matrix(message: ros.Pose) -> Array:
     """Return the homogeneous matrix, shape (4, 4). Raises ValueError as `rotation` does."""
     return _homogeneous(rotation(message.orientation), vector(message.position))
 
 
-def transform_matrix(message: Transform) -> Array:
+def transform_matrix(message: ros.Transform) -> Array:
     """Return the homogeneous matrix, shape (4, 4). Raises ValueError as `rotation` does."""
     return _homogeneous(rotation(message.rotation), vector(message.translation))
 
 
-def pose_of_frame(message: TFMessage, frame: str | None, parent: str) -> Array | None:
+def pose_of_frame(message: ros.TFMessage, frame: str | None, parent: str) -> Array | None:
     """Return the pose of `frame` in `parent`, shape (4, 4); None if it is missing. Raises ValueError as `rotation` does."""
     for item in message.transforms:
         if item.child_frame_id == frame and item.header.frame_id == parent:
@@ -109,69 +91,69 @@ def _homogeneous(R: Array, p: Array) -> Array:
     return X
 
 
-def pose_message(R: Array, p: Array) -> Pose:
+def pose_message(R: Array, p: Array) -> ros.Pose:
     """Return the `Pose` of a rotation matrix, shape (3, 3), and an origin [m], shape (3,)."""
-    return Pose(Point(*p.tolist()), Quaternion(*quaternion(R)))
+    return ros.Pose(ros.Point(*p.tolist()), ros.Quaternion(*quaternion(R)))
 
 
-def transform_message(X: Array) -> Transform:
+def transform_message(X: Array) -> ros.Transform:
     """Return the `Transform` of a homogeneous matrix, shape (4, 4)."""
-    return Transform(Vector3(*X[:3, 3].tolist()), Quaternion(*quaternion(X[:3, :3])))
+    return ros.Transform(ros.Vector3(*X[:3, 3].tolist()), ros.Quaternion(*quaternion(X[:3, :3])))
 
 
-def twist_message(V: Array) -> Twist:
+def twist_message(V: Array) -> ros.Twist:
     """Return the `Twist` of an array, linear [m/s] then angular [rad/s], shape (6,)."""
-    return Twist(Vector3(*V[:3].tolist()), Vector3(*V[3:].tolist()))
+    return ros.Twist(ros.Vector3(*V[:3].tolist()), ros.Vector3(*V[3:].tolist()))
 
 
-def wrench_message(F: Array) -> Wrench:
+def wrench_message(F: Array) -> ros.Wrench:
     """Return the `Wrench` of an array, force [N] then torque [N m], shape (6,)."""
-    return Wrench(Vector3(*F[:3].tolist()), Vector3(*F[3:].tolist()))
+    return ros.Wrench(ros.Vector3(*F[:3].tolist()), ros.Vector3(*F[3:].tolist()))
 
 
-def tool_message(header: Header, motion: Sequence[float], radius: float) -> ToolState:
+def tool_message(header: ros.Header, motion: Sequence[float], radius: float) -> ros.ToolState:
     """Return the `ToolState` of an indenter with a radius [m] in world.
 
     `motion`: position [m], orientation x, y, z, w, and velocities [m/s, rad/s] of its centre.
     """
     px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = motion
-    pose = Pose(Point(px, py, pz), Quaternion(x, y, z, w))
-    return ToolState(header, pose, Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz)), radius)
+    pose = ros.Pose(ros.Point(px, py, pz), ros.Quaternion(x, y, z, w))
+    return ros.ToolState(header, pose, ros.Twist(ros.Vector3(vx, vy, vz), ros.Vector3(wx, wy, wz)), radius)
 
 
-def frames_message(header: Header, names: Sequence[str], poses: Array) -> TFMessage:
+def frames_message(header: ros.Header, names: Sequence[str], poses: Array) -> ros.TFMessage:
     """Return the `TFMessage` of frames by name: position [m], orientation x, y, z, w, shape (n, 7)."""
-    transforms = [Transform(Vector3(*pose[:3]), Quaternion(*pose[3:])) for pose in poses.tolist()]
-    return TFMessage([TransformStamped(header, *pair) for pair in zip(names, transforms, strict=True)])
+    transforms = [ros.Transform(ros.Vector3(*pose[:3]), ros.Quaternion(*pose[3:])) for pose in poses.tolist()]
+    return ros.TFMessage([ros.TransformStamped(header, *pair) for pair in zip(names, transforms, strict=True)])
 
 
-def vector(message: Point | Vector3) -> Array:
+def vector(message: ros.Point | ros.Vector3) -> Array:
     """Return x, y and z, shape (3,)."""
     return np.array((message.x, message.y, message.z))
 
 
-def vectors(messages: Iterable[Point | Vector3]) -> Array:
+def vectors(messages: Iterable[ros.Point | ros.Vector3]) -> Array:
     """Return x, y and z of each message, shape (n, 3)."""
     return np.array([(message.x, message.y, message.z) for message in messages], dtype=np.float64).reshape(-1, 3)
 
 
-def point_message(p: ArrayLike) -> Point:
+def point_message(p: ArrayLike) -> ros.Point:
     """Return the `Point` of an array, shape (3,)."""
-    return Point(*np.asarray(p, dtype=np.float64).tolist())
+    return ros.Point(*np.asarray(p, dtype=np.float64).tolist())
 
 
-def vector_message(v: ArrayLike) -> Vector3:
+def vector_message(v: ArrayLike) -> ros.Vector3:
     """Return the `Vector3` of an array, shape (3,)."""
-    return Vector3(*np.asarray(v, dtype=np.float64).tolist())
+    return ros.Vector3(*np.asarray(v, dtype=np.float64).tolist())
 
 
-def twist(message: Twist) -> Array:
+def twist(message: ros.Twist) -> Array:
     """Return linear [m/s] then angular [rad/s], shape (6,)."""
     v, w = message.linear, message.angular
     return np.array((v.x, v.y, v.z, w.x, w.y, w.z))
 
 
-def wrench(message: Wrench) -> Array:
+def wrench(message: ros.Wrench) -> Array:
     """Return force [N] then torque [N m], shape (6,)."""
     f, m = message.force, message.torque
     return np.array((f.x, f.y, f.z, m.x, m.y, m.z))
@@ -189,37 +171,37 @@ def mesh_arrays(message: Any) -> MeshArrays:
 
 
 def mesh_message(
-    header: Header, vertices: ArrayLike, normals: ArrayLike = (), triangles: ArrayLike = (), breathing: ArrayLike = ()
-) -> SurfaceMesh:
+    header: ros.Header, vertices: ArrayLike, normals: ArrayLike = (), triangles: ArrayLike = (), breathing: ArrayLike = ()
+) -> ros.SurfaceMesh:
     """Return the `SurfaceMesh` of arrays, shaped as in `MeshArrays`; arrays that are left out are empty in the message."""
 
     def flat(array: ArrayLike, kind: Any = np.float32) -> Any:
         return np.ascontiguousarray(array, dtype=kind).reshape(-1)
 
-    return SurfaceMesh(header, flat(vertices), flat(normals), flat(triangles, np.uint32), flat(breathing))
+    return ros.SurfaceMesh(header, flat(vertices), flat(normals), flat(triangles, np.uint32), flat(breathing))
 
 
-def cloud_message(header: Header, points: Array) -> PointCloud2:
+def cloud_message(header: ros.Header, points: Array) -> ros.PointCloud2:
     """Return the `PointCloud2` of points [m], shape (n, 3): x y z as float32."""
-    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
+    fields = [ros.PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
     data = np.ascontiguousarray(points, "<f4").view(np.uint8).reshape(-1)
-    return PointCloud2(header, 1, len(points), fields, False, 12, 12 * len(points), data, True)
+    return ros.PointCloud2(header, 1, len(points), fields, False, 12, 12 * len(points), data, True)
 
 
-def camera_info(header: Header, size_px: tuple[int, int], K: Array) -> CameraInfo:
+def camera_info(header: ros.Header, size_px: tuple[int, int], K: Array) -> ros.CameraInfo:
     """Return the `CameraInfo` of images without distortion: `size_px` height and width, K [px], shape (3, 3)."""
-    P, whole = np.hstack((K, np.zeros((3, 1)))).ravel(), RegionOfInterest(0, 0, 0, 0, False)
-    return CameraInfo(header, *size_px, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
+    P, whole = np.hstack((K, np.zeros((3, 1)))).ravel(), ros.RegionOfInterest(0, 0, 0, 0, False)
+    return ros.CameraInfo(header, *size_px, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
 
 
-def depth_message(header: Header, depth: NDArray[np.float32]) -> Image:
+def depth_message(header: ros.Header, depth: NDArray[np.float32]) -> ros.Image:
     """Return the `Image` of a depth image [m], shape (height, width), NaN where invalid: 32FC1, little-endian."""
     height, width = depth.shape
     data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
-    return Image(header, height, width, "32FC1", 0, 4 * width, data)
+    return ros.Image(header, height, width, "32FC1", 0, 4 * width, data)
 
 
-def depth_in_metres(name: str, message: Image) -> NDArray[np.float32]:
+def depth_in_metres(name: str, message: ros.Image) -> NDArray[np.float32]:
     """Return depth [m], shape (height, width), NaN where invalid. Rows of the `Image` may be padded.
 
     Raises ValueError for an encoding that is not in `DEPTH_ENCODINGS`, or too little data. Its text begins with `name`.

@@ -271,8 +271,12 @@ class LiveMonitor:
         now = monotonic()
         self.graph.changes()
         self.monitor.set_entities(self.graph.alive.values(), now)
-        self._receive_control()
-        self._receive_reports(now)
+        for message in _decode(self._control, self._decode_control):
+            if message.command == RunControl.GRANT and message.tick >= UNIX_NS:  # the common start of a wall-clock run
+                self.monitor.rate = self.monitor.rate or Settings.read().rate or 1.0
+        for message in _decode(self._reports, self._decode_report):
+            if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
+                self.reports[message.role] = message, now
         for name, subscriber in self._subscribers.items():
             for sample in list(_waiting(subscriber)):
                 self._receive(name, sample, now)
@@ -298,16 +302,6 @@ class LiveMonitor:
         self.monitor.receive(name, sent, sequence, gid, sample.payload.to_bytes(), now)
         age = (time_ns() - sent) / 1e6
         self.offsets[name] = min(age, self.offsets.get(name, age))
-
-    def _receive_control(self) -> None:
-        for message in _decode(self._control, self._decode_control):
-            if message.command == RunControl.GRANT and message.tick >= UNIX_NS:  # the common start of a wall-clock run
-                self.monitor.rate = self.monitor.rate or Settings.read().rate or 1.0
-
-    def _receive_reports(self, now: float) -> None:
-        for message in _decode(self._reports, self._decode_report):
-            if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
-                self.reports[message.role] = message, now
 
 
 def _waiting(subscriber: Any) -> Iterator[Any]:

@@ -111,11 +111,6 @@ def folder() -> Path:
     return path
 
 
-def matching_runs(chosen: str | None) -> list[Run]:
-    """Return the live runs that match a process id or a part of a name, oldest first; all runs for None."""
-    return [run for run in live_runs() if chosen is None or chosen == str(run.pid) or chosen in run.name]
-
-
 def live_runs() -> list[Run]:
     """Return the active runs of this user on this machine, oldest first. Removes files of killed runs."""
     remove_leftovers()
@@ -177,11 +172,15 @@ def find_buses(connect: Sequence[str] | None = None, chosen: str | None = None, 
 
 
 def named_runs(chosen: str | None, otherwise: str = "") -> list[Run]:
-    """Return the matching runs of this machine, oldest first, at least one. Raises NoBusError, with the hint `otherwise`."""
-    if found := matching_runs(chosen):
+    """Return the runs of this machine with this process id or part of a name, oldest first, at least one; all runs for None.
+
+    Raises NoBusError, with the hint `otherwise`.
+    """
+    live = live_runs()
+    if found := [run for run in live if chosen is None or chosen == str(run.pid) or chosen in run.name]:
         return found
     if chosen is not None:
-        raise NoBusError(f"no active run {chosen!r}; active: {_names(live_runs()) or 'none'}")
+        raise NoBusError(f"no active run {chosen!r}; active: {_names(live) or 'none'}")
     raise NoBusError(f"no active run (searched {folder()}); start one with `palpate run`{f', {otherwise}' if otherwise else ''}")
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
+from palpate_bus.runtime.composed import Group
 from palpate_bus.runtime.conductor_link import TIMES
-from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import NEVER, ForgedSenderError, InputBuffer, LockstepError, Outgoing, Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat

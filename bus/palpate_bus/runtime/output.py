@@ -6,7 +6,6 @@ producer another send per message and the recorder a wake-up each. A chunk every
 
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,15 +20,6 @@ CHUNK_BYTES = 1 << 22
 
 _encode = codec.encoder(CHUNK_TYPE)
 _decode = codec.decoder(CHUNK_TYPE)
-
-
-class ChunkMessage(NamedTuple):
-    """A message of a chunk."""
-
-    topic: str
-    payload: bytes
-    stamp: int
-    sequence: int
 
 
 class ChunkWriter:
@@ -63,8 +53,8 @@ class ChunkWriter:
         return _encode(RecordChunk(self._role, t, list(self._topics), *rows, np.frombuffer(b"".join(payloads), np.uint8)))
 
 
-def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
-    """Return the tick [ns] that a chunk covers, and its messages. Raises CodecError if it is invalid."""
+def unpack_chunk(payload: bytes) -> tuple[int, Iterator[tuple[str, bytes, int, int]]]:
+    """Return the tick [ns] that a chunk covers, and topic, payload, stamp and sequence of its messages. Raises CodecError."""
     chunk = _decode(payload)
     data = chunk.data.tobytes()
     columns = [column.tolist() for column in (chunk.topic, chunk.stamp, chunk.sequence, chunk.length)]
@@ -78,7 +68,7 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
     ends = list(accumulate(lengths, initial=0))
     payloads = (data[begin:end] for begin, end in pairwise(ends))
     names = (chunk.topics[topic] for topic in topics)
-    return int(chunk.tick), map(ChunkMessage, names, payloads, stamps, sequences)
+    return int(chunk.tick), zip(names, payloads, stamps, sequences, strict=True)
 
 
 class ServiceOutput:

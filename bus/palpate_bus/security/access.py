@@ -52,8 +52,6 @@ class _Rules:
         For the router, a message sent by a member is an ingress and a received one an egress; for subscriptions and queries it
         is the reverse. `messages`: the kinds that pass from sender to receiver, and those that pass back. `what` names the rule.
         """
-        if not keys:
-            return
         forward, reverse = ("ingress", "egress") if sends else ("egress", "ingress")
         for flow, kinds in ((forward, messages[0]), (reverse, messages[1])):
             name = f"{who} {what} {flow}"

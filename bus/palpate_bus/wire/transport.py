@@ -46,9 +46,6 @@ class Sender(Protocol):
     def hello(self) -> None:
         """Send the empty message that tests the edge."""
 
-    def close(self) -> None:
-        """Undeclare it."""
-
 
 class Publisher:
     """Sends on one key with the QoS of the contract."""
@@ -89,10 +86,6 @@ class Publisher:
     def _attachment(self, sequence: int, payload: bytes) -> bytes:
         attachment = self._pack(sequence, self._now())
         return attachment if self._tagger is None else attachment + self._tagger.tag(attachment, payload)
-
-    def close(self) -> None:
-        """Undeclare the publisher."""
-        self._publisher.undeclare()
 
 
 class TagCheck:

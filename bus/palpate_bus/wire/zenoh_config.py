@@ -33,7 +33,6 @@ Round trip of 300 bytes between two Python processes (SimpleQueue receivers, fiv
 import atexit
 import errno
 import json
-import logging
 import os
 import re
 import signal
@@ -119,13 +118,9 @@ class BusOptions:
         given["lowlatency"] = settings.lowlatency and not wallclock
         return cls(**given, drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wallclock else LOCKSTEP_DROP_WAIT_US)
 
-    def settings(self) -> dict[str, Any]:
-        """Return these options as fields for `Settings.replace`, without `drop_wait_us`, which follows from the runtime."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "drop_wait_us"}
-
     def to_env(self) -> dict[str, str]:
         """Return the environment variables for another process with these options; empty ones override inherited ones."""
-        own = self.settings()
+        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "drop_wait_us"}  # of the runtime
         environment = Settings.read({}).replace(**own).to_env()
         return {variable(name): environment[variable(name)] for name in own}
 
@@ -295,14 +290,9 @@ def free_port() -> int:
 DEFAULT_ENDPOINT = "tcp/[::]:7447"
 """Endpoint on which zenohd and rmw_zenohd listen by default."""
 
-log = logging.getLogger(__name__)
-
 
 def serve(
-    listen: Sequence[str] = (DEFAULT_ENDPOINT,),
-    ready: Callable[[str], None] = log.info,
-    tls: Path | None = None,
-    access: Mapping[str, Any] | None = None,
+    listen: Sequence[str], ready: Callable[[str], None], tls: Path | None = None, access: Mapping[str, Any] | None = None
 ) -> None:
     """Route until SIGINT or SIGTERM; call it from the main thread.
 
