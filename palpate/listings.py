@@ -3,10 +3,9 @@
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
-from palpate.console import SteadyConsole, print_line, wide_console
+from palpate.console import SteadyConsole, print_line, table, wide_console
 
 
 def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
@@ -16,20 +15,20 @@ def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them a
     if as_json:
         print_line([load_scenario(name).model_dump(mode="json") for name in scenario_names()])
         return
-    table = Table("scenario", "lesions", "description", box=None)
+    rows = table("scenario", "lesions", "description")
     for name in scenario_names():
         scenario = load_scenario(name)
-        table.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
-    SteadyConsole().print(table)
+        rows.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
+    SteadyConsole().print(rows)
 
 
 def topics() -> None:
     """Show the contract: every topic with type, rate, who writes and who reads it."""
     from palpate_bus.contract import contract
 
-    table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
+    rows = table("topic", "type", "producer", "period", "QoS", "hashed", "readers")
     for topic in contract().topics.values():
-        table.add_row(
+        rows.add_row(
             topic.name if topic.visibility == "public" else Text.assemble(topic.name, (f" ({topic.visibility})", "dim")),
             topic.type.replace("/msg/", "/"),
             topic.producer,
@@ -38,4 +37,4 @@ def topics() -> None:
             "yes" if topic.hashed else "",
             ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking),
         )
-    wide_console(160).print(table)
+    wide_console(160).print(rows)

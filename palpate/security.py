@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
-from palpate.console import SteadyConsole
+from palpate.console import SteadyConsole, table
 from palpate_errors import UserError
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
@@ -42,11 +41,11 @@ def show(folder: Folder = DEFAULT) -> None:
     """List the certificates of a folder, their expiry and fingerprints."""
     from palpate_bus.security.keys import certificates
 
-    table = Table("name", "valid until", "SHA-256", box=None)
+    rows = table("name", "valid until", "SHA-256")
     for certificate in certificates(folder):
         until = Text.assemble(f"{certificate.until:%Y-%m-%d}", (" expired" if certificate.expired else "", "red"))
-        table.add_row(certificate.name, until, certificate.fingerprint[:32])
-    SteadyConsole().print(table)
+        rows.add_row(certificate.name, until, certificate.fingerprint[:32])
+    SteadyConsole().print(rows)
 
 
 SECURE_ENDPOINT = "tls/[::]:7447"

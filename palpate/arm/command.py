@@ -14,9 +14,7 @@ Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next t
 @app.command()
 def check(arm: Name) -> None:
     """Say what an arm has, and what is missing or impossible, each with its link or joint. Starts nothing."""
-    from rich.table import Table
-
-    from palpate.console import SteadyConsole, say
+    from palpate.console import SteadyConsole, say, table
     from palpate.run.clearance import advice, touching
     from palpate_errors import ExitStatus
     from palpate_models.robot.arm import check_arm
@@ -36,13 +34,13 @@ def check(arm: Name) -> None:
         say(f"{arm}: {fault}")
     if found is None:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    table = Table("joint", "range [rad]", "speed [rad/s]", "torque [N m]", "home [rad]", "link [kg]", box=None)
+    rows = table("joint", "range [rad]", "speed [rad/s]", "torque [N m]", "home [rad]", "link [kg]")
     limits = (found.lower_rad, found.upper_rad, found.velocity_radps, found.torque_nm, found.home_rad)
     masses = [inertia.mass for inertia in found.inertias[1:]]
     for name, low, high, speed, torque, home, mass in zip(found.joint_names, *limits, masses, strict=True):
-        table.add_row(name, f"{low:.2f} to {high:.2f}", f"{speed:.2f}", f"{torque:.0f}", f"{home:.2f}", f"{mass:.2f}")
+        rows.add_row(name, f"{low:.2f} to {high:.2f}", f"{speed:.2f}", f"{torque:.0f}", f"{home:.2f}", f"{mass:.2f}")
     console = SteadyConsole()
-    console.print(table)
+    console.print(rows)
     elbow, shapes = found.joint_names[found.elbow[0]], sum(map(len, found.capsules))
     parts = f"flange {found.link_names[-1]}, elbow {elbow}, {shapes} collision shapes"
     if origin:

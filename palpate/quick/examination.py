@@ -21,21 +21,9 @@ from palpate_models.numerics.frames import Array, Ints, apply, inverse
 from palpate_models.scenario.load import ScenarioError, exam_input
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import Following, Scenario
+from palpate_planning import stroke as planning
 from palpate_planning.contact import THRESHOLDS, ContactMeasurement
 from palpate_planning.interruptions import WALL
-from palpate_planning.stroke import (
-    PUSHING,
-    STROKE,
-    Descent,
-    Stages,
-    StrokeInput,
-    StrokeStage,
-    is_limited,
-    is_steady,
-    lift,
-    press,
-    travel,
-)
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.coverage import Stroke, strokes, transfer
 from palpate_planning.strokes.path import SurfacePath, frames_along
@@ -85,7 +73,7 @@ class PeriodRow:
     path: SkinPath
     at: int
     """Index of the place on its path."""
-    stage: StrokeStage
+    stage: planning.StrokeStage
     depth: float
     """Measured [m]."""
     setpoint: float
@@ -105,7 +93,7 @@ class PeriodRow:
     limited: bool
 
 
-class _Descent(Descent):
+class _Descent(planning.Descent):
     """A descent whose touch corrects no wall: the error of its zero is drawn when the sensor is tared."""
 
     def __init__(self, motion: StrokeMotion, depth: float, on_tared: Callable[[int], None]) -> None:
@@ -119,7 +107,7 @@ class _Descent(Descent):
             self._on_tared(self.stroke)
         return tared
 
-    def learn(self, now: StrokeInput) -> None:
+    def learn(self, now: planning.StrokeInput) -> None:
         """Leave the wall as it is."""
 
 
@@ -154,7 +142,7 @@ class QuickExamination:
         """End of the previous stroke, in A as registered [m], shape (2,)."""
         self._zero_m = 0.0
         self._force, self._load, self._touching = 0.0, 0.0, False
-        self._depth = -STROKE.hop_height_m
+        self._depth = -planning.STROKE.hop_height_m
         self._count = 0
 
     def run(self) -> list[PeriodRow]:
@@ -168,17 +156,17 @@ class QuickExamination:
         target = np.zeros(1, dtype=np.int64)
         return self._drive(self._stroke(Stroke(xy[None], target, target), depth_m))
 
-    def _drive(self, stages: Stages[None]) -> list[PeriodRow]:
+    def _drive(self, stages: planning.Stages[None]) -> list[PeriodRow]:
         rows: list[PeriodRow] = []
         next(stages)
         with suppress(StopIteration):
             while True:
                 contact = self._measure_contact()
-                stage = stages.send(StrokeInput(self._count, contact, gate_open=self._open))
+                stage = stages.send(planning.StrokeInput(self._count, contact, gate_open=self._open))
                 rows.append(self._period(stage, contact))
         return rows
 
-    def _strokes(self) -> Stages[None]:
+    def _strokes(self) -> planning.Stages[None]:
         """Planning's strokes over all targets, with paths between them."""
         scan, exam = scan_of(self._exam, self._believed.in_A), self._exam
         xy = scan.targets
@@ -186,14 +174,14 @@ class QuickExamination:
         for stroke in strokes(xy, scan.line_of_target, usable, scan.joined, exam.mode, exam.spacing_m):
             yield from self._stroke(stroke)
 
-    def _stroke(self, stroke: Stroke, depth_m: float | None = None) -> Stages[None]:
+    def _stroke(self, stroke: Stroke, depth_m: float | None = None) -> planning.Stages[None]:
         motion = self._motion
         if self._before is not None:
             self._start(self._lay(transfer(self._before, stroke.xy[0]), stroke.targets[:1], contact=False))
-            yield from travel(motion, motion.segment.path.length)
+            yield from planning.travel(motion, motion.segment.path.length)
         self._start(self._lay(stroke.xy, stroke.targets, stroke.visits, depth_m=depth_m))
-        yield from press(motion, self._descent)
-        yield from lift(motion, lambda t: STROKE.hop_height_m)
+        yield from planning.press(motion, self._descent)
+        yield from planning.lift(motion, lambda t: planning.STROKE.hop_height_m)
         self._before = stroke.xy[-1]
 
     def _start(self, path: SkinPath) -> None:
@@ -253,11 +241,12 @@ class QuickExamination:
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
         return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallEstimate(0.0, 0.0, self.loop.uncertainty_m), *measured)
 
-    def _period(self, stage: StrokeStage, contact: ContactMeasurement) -> PeriodRow:
+    def _period(self, stage: planning.StrokeStage, contact: ContactMeasurement) -> PeriodRow:
         """Move the indenter for a period, with the errors of this examination."""
         motion, loop, patient, path, k = self._motion, self.loop, self.patient, self._path, self._count
         self._count += 1
-        motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT, pushing=stage in PUSHING)
+        in_contact = self._touching and stage is not planning.StrokeStage.LIFT
+        motion.regulate(contact, in_contact=in_contact, pushing=stage in planning.PUSHING)
         at = int(motion.along.position * path.per_m + 0.5)
         self._depth = motion.regulation.reference_m + loop.regulation.at(k)
         share = path.breathing[at]
@@ -271,7 +260,7 @@ class QuickExamination:
         self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
         self._touching = self._force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         self._open = not self._gated or abs(loop.followed * excursion) < WALL.gate_m
-        limited = is_limited(stage, motion)
+        limited = planning.is_limited(stage, motion)
         return PeriodRow(
             time=patient.time,
             path=path,
@@ -285,6 +274,6 @@ class QuickExamination:
             true_depth=depth,
             true_force=force,
             touching=self._touching,
-            steady=self._touching and self._open and is_steady(stage, motion, limited=limited),
+            steady=self._touching and self._open and planning.is_steady(stage, motion, limited=limited),
             limited=limited,
         )

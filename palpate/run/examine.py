@@ -13,10 +13,9 @@ from palpate.environment import set_environment
 from palpate.report.files import bring_back
 from palpate.report.recovery import Resumption, checkpoint_given, resumption
 from palpate.run.composed import run_composed
-from palpate.run.conclusion import conclude
-from palpate.run.conducting import IN_REAL_TIME, NEEDS_WALLCLOCK
+from palpate.run.conducting import IN_REAL_TIME, NEEDS_WALLCLOCK, conclude
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import WatchedRoom, check_room, results_folder, usual_folder, what_it_takes
+from palpate.run.folder import check_room, results_folder, usual_folder, watch_room, what_it_takes
 from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
@@ -63,7 +62,7 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
         record, checkpoint = {"PALPATE_RECORD": options.record}, None if before is None else before.checkpoint
         with display, set_environment(record), checkpoint_given(checkpoint):
             check_room(folder, scenario.exam, options.record)
-            tell = WatchedRoom(folder, display.show, say).check
+            tell = watch_room(folder, display.show, say)
             result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)
             if result.unbegun:
                 raise KeyboardInterrupt

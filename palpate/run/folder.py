@@ -166,19 +166,18 @@ def free_mb(folder: Path) -> float:
         return 0.0
 
 
-class WatchedRoom:
-    """Passes on the progress of a run, and warns once when the disk of its results is nearly full."""
+def watch_room(folder: Path, tell: Tell, warn: Callable[[str], None]) -> Tell:
+    """Return what passes on the progress of a run, and warns once when the disk of its results is nearly full."""
+    warned = False
 
-    def __init__(self, folder: Path, tell: Tell, warn: Callable[[str], None]) -> None:
-        self._folder, self._tell, self._warn = folder, tell, warn
-        self._warned = False
+    def check(progress: RunProgress) -> None:
+        nonlocal warned
+        if not warned and (left := free_mb(folder)) < LOW_MB:
+            warned = True
+            warn(f"{folder}: {left:.0f} MB are left there: recordings will stop, the examination continues")
+        tell(progress)
 
-    def check(self, progress: RunProgress) -> None:
-        """Check the free space and passes on the progress."""
-        if not self._warned and (left := free_mb(self._folder)) < LOW_MB:
-            self._warned = True
-            self._warn(f"{self._folder}: {left:.0f} MB are left there: recordings will stop, the examination continues")
-        self._tell(progress)
+    return check
 
 
 def another_folder() -> Path:

@@ -9,15 +9,11 @@ from rich.text import Text
 
 from palpate.run.inputs import Outlook, duration_text
 from palpate_bus.messages import NS, ExamState
+from palpate_bus.messages.codes import Phase
 from palpate_bus.runs.operator import HINT, WORDS, OperatorKeys
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam, Mode
 
-PHASES: Final = {
-    getattr(ExamState, f"PHASE_{name}"): name.lower()
-    for name in ("HOME", "LOOK", "PLAN", "APPROACH", "INDENT", "SCAN", "RETRACT", "RETURN", "ASSESS", "DONE", "ABORTED", "HELD")
-}
-"""Phase names by value."""
 STROKE: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 """The phases of every stroke."""
 WHY: Final = {
@@ -42,7 +38,7 @@ class Narration:
     def part(self, state: Any) -> str:
         """Return the current part in a word or two: `plan`, `touch 2/9`, `scan`."""
         if state.phase not in STROKE:
-            return PHASES[state.phase]
+            return Phase(state.phase).name.lower()
         if self._touching(state):
             return f"touch {max(state.stroke - self._strokes_before, 1)}/{self._outlook.touches}"
         return "search" if self._exam.searched else "scan"

@@ -16,7 +16,7 @@ from palpate.report.evidence import points, steady_contact
 from palpate.report.page import write_page
 from palpate.report.results import Known, assemble, clean_world, print_findings, scores_text, truth_of_run, write_results
 from palpate.report.rows import Report
-from palpate.run.conclusion import conclude
+from palpate.run.conducting import conclude
 from palpate.run.roles import write_scenario_files
 from palpate_bus.messages import NS, ExamState, RobotStatus, blank, header
 from palpate_bus.runtime.failure import Failure, FailureCode

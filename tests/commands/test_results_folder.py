@@ -20,9 +20,8 @@ from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run import conducting, examine
-from palpate.run.conclusion import conclude
-from palpate.run.conducting import conduct_others
-from palpate.run.folder import WatchedRoom, another_folder, check_room, lock_output, results_folder, set_aside
+from palpate.run.conducting import conclude, conduct_others
+from palpate.run.folder import another_folder, check_room, lock_output, results_folder, set_aside, watch_room
 from palpate.run.options import RunOptions
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
@@ -198,10 +197,10 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
 
 def test_a_disk_that_fills_up_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    room = WatchedRoom(tmp_path, lambda _: None, said.append)
+    tell = watch_room(tmp_path, lambda _: None, said.append)
     for megabytes in (500, 10, 5):
         leave(megabytes, monkeypatch)
-        room.check(RunProgress(0, 1.0, Collected(), ()))
+        tell(RunProgress(0, 1.0, Collected(), ()))
     assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
 
 
