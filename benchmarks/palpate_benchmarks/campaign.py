@@ -20,8 +20,7 @@ from typing import Any, Final, NamedTuple
 
 import psutil
 
-from palpate.report.archive import EvidenceError
-from palpate.report.evidence import peak_force
+from palpate.report.evidence import EvidenceError, peak_force
 from palpate.report.recovery import recover_run
 from palpate.run.group import one_per_process
 from palpate.run.roles import WORKERS
@@ -31,7 +30,7 @@ from palpate_benchmarks.injection import ROLES, FaultLog, FaultResult, FaultRun,
 from palpate_benchmarks.liar import INJECTED
 from palpate_bus.contract import CONDUCTOR, Topic, contract
 from palpate_bus.messages import NS, ExamState, RobotStatus, SupervisorState, nanoseconds
-from palpate_bus.messages.fields import leaves
+from palpate_bus.messages.codec import leaves
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode

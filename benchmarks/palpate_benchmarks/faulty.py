@@ -30,7 +30,7 @@ import zenoh
 from palpate_benchmarks.liar import INJECTED, fill, shift_stamp
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import NS, codec
-from palpate_bus.messages.fields import leaves, numbers
+from palpate_bus.messages.codec import leaves, numbers
 from palpate_bus.run import load_service, run_service
 from palpate_bus.wire.transport import Sender, Transport
 from palpate_models.scenario.load import load_scenario

@@ -32,7 +32,7 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create as create_service
 from palpate_bus.messages import MS, NS, Message, nanoseconds, time_message
-from palpate_bus.messages.fields import numbers
+from palpate_bus.messages.codec import numbers
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Services

@@ -25,7 +25,7 @@ from palpate_benchmarks.injection import FaultLog, examination, logged, signs_of
 from palpate_benchmarks.liar import INJECTED, WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.messages import MS, NS, ExamState, nanoseconds
-from palpate_bus.messages.fields import leaves
+from palpate_bus.messages.codec import leaves
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree

@@ -15,7 +15,7 @@ from palpate_bus import messages as msg
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import MS, UNIX_NS, RunControl, codec, header
-from palpate_bus.messages.fields import leaves, numbers
+from palpate_bus.messages.codec import leaves, numbers
 from palpate_bus.monitor.health import RECENT_S, TopicHealth, Violation, topic_statuses
 from palpate_bus.monitor.monitor import LiveMonitor, Monitor
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
@@ -272,6 +272,6 @@ def test_a_run_in_wall_clock_mode_is_judged_at_the_rate_of_the_environment(monke
         watching = LiveMonitor(bus, RULES, 0, ("clock",))
         watching._control.undeclare()
         watching._control = SimpleNamespace(handler=SimpleNamespace(try_recv=received.__next__), undeclare=lambda: None)
-        watching._receive_control()
+        watching.poll()
         watching.close()
     assert watching.monitor.rate == 0.25

@@ -9,7 +9,7 @@ import yaml
 
 from palpate_bus.contract import Contract, Edge, Topic, Visibility, contract, parse
 from palpate_bus.messages import codec
-from palpate_bus.messages.fields import leaves
+from palpate_bus.messages.codec import leaves
 from palpate_bus.messages.typestore import palpation_definitions
 
 RULES = contract()

@@ -27,8 +27,7 @@ from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages import Message, nanoseconds
-from palpate_bus.messages.codec import message_type, store
-from palpate_bus.messages.fields import LeafField, leaves, numbers
+from palpate_bus.messages.codec import LeafField, leaves, message_type, numbers, store
 from palpate_errors import RunError
 
 

@@ -3,8 +3,8 @@
 In a group messages are delivered at once. A message is encoded once, since the run hash covers its bytes. Readers get the message
 itself, with copies of its arrays, if decoding would give an equal one, else the first reader decodes it. `Composed` and
 `distributed` (between other processes) drive a group in the same order: by tick, then by the same_tick edges of the contract
-among all roles, also those outside the group. So the first of all pending steps in this order has all its inputs, and groups that wait
-for each other do not deadlock.
+among all roles, also those outside the group. So the first of all pending steps in this order has all its inputs, and groups
+that wait for each other do not deadlock.
 """
 
 from collections.abc import Callable, MutableSequence, Sequence

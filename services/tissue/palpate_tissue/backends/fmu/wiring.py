@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages import NS, CodecError, Message, blank
-from palpate_bus.messages.fields import LeafField, leaves, numbers
+from palpate_bus.messages.codec import LeafField, leaves, numbers
 from palpate_errors import restate
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
