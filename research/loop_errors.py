@@ -24,9 +24,7 @@ from scipy.optimize import curve_fit
 
 from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting_of
 from palpate.quick.patient import PERIOD_S
-from palpate.report import archive
-from palpate.report.archive import read_evidence
-from palpate.report.evidence import points
+from palpate.report.evidence import FILE, points, read_evidence
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_assessment.service import SEEN, skin_of
@@ -76,8 +74,8 @@ def runs_in(folders: Sequence[Path]) -> list[Path]:
     """Return the run folders among these, and the completed runs within the others, each once."""
     found: list[Path] = []
     for folder in folders:
-        inside = sorted(path.parent for path in folder.glob(f"*/{archive.FILE}"))
-        found += [folder] if (folder / archive.FILE).is_file() or not inside else inside
+        inside = sorted(path.parent for path in folder.glob(f"*/{FILE}"))
+        found += [folder] if (folder / FILE).is_file() or not inside else inside
     return list(dict.fromkeys(path.resolve() for path in found))
 
 
@@ -251,7 +249,7 @@ def examine(number: int, level: str, breathing: str, out: Path, settings: Sequen
 
     def one(seed: int) -> Path:
         folder = out / f"{level}-{breathing}-{seed}"
-        if not (folder / archive.FILE).is_file():
+        if not (folder / FILE).is_file():
             lumps = "phantom.draw.lumps=[1, 1]" if seed % 2 else "phantom.draw.lumps=[0, 0]"
             words = [f"errors={level}", f"phantom.breathing.kind={breathing}", lumps, *settings]
             options = [word for setting in words for word in ("--set", setting)]

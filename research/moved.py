@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from palpate.report.archive import FILE, EvidenceError, read_evidence
+from palpate.report.evidence import FILE, EvidenceError, read_evidence
 from palpate_bus.contract import contract
 from palpate_bus.messages import NS, ExamState, nanoseconds
 from palpate_bus.messages.codec import decode

@@ -20,8 +20,7 @@ from scipy import stats
 
 from palpate.quick.case import run_quick
 from palpate.quick.errors import loop_errors
-from palpate.report.archive import read_evidence
-from palpate.report.evidence import map_of
+from palpate.report.evidence import map_of, read_evidence
 from palpate.report.results import truth_of_run
 from palpate.report.rows import Report
 from palpate.report.scoring import Map

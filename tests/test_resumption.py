@@ -15,7 +15,7 @@ from examination import SHORT, TINY, Finished, command, palpate_run, service_pro
 from scipy.spatial import KDTree
 
 from palpate.report import recovery
-from palpate.report.archive import EvidenceError
+from palpate.report.evidence import EvidenceError
 from palpate.report.recovery import FOLDER
 from palpate_bus.messages.geometry import Array
 from palpate_bus.recordings import open_recording

@@ -20,7 +20,7 @@ def reproduce(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Reproduce figures 3, 5, 6, 7 and 8 and the claims of the original paper from new runs. This takes about ten minutes."""
-    from palpate.report.archive import EvidenceError, read_completed
+    from palpate.report.evidence import EvidenceError, read_completed
     from palpate.run.inputs import check_usable
     from palpate_reproduction.page import write_page
     from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, ReproductionError, perform, record_graph

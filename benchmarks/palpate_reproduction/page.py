@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from palpate.report.archive import Evidence, read_evidence
+from palpate.report.evidence import Evidence, read_evidence
 from palpate.report.figures import INK, QUIET, Drawing, panel_title
 from palpate.report.page import known_truth, read_report, sample_places
 from palpate.report.page_figures import plain

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from palpate.live.bus import join_bus, present
 from palpate.live.topic import topic_rows
-from palpate.report.archive import read_completed
+from palpate.report.evidence import read_completed
 from palpate_bus.runs.announcement import Run, live_runs
 
 GRAPH: Final = "graph.json"

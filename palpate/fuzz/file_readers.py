@@ -20,7 +20,7 @@ from trimesh.exchange.stl import export_stl, export_stl_ascii
 
 from palpate.fuzz.bus_readers import FuzzTarget, accepts, random_payload
 from palpate.recording.read import read_recording
-from palpate.report.archive import FILE, read_evidence, write_evidence
+from palpate.report.evidence import FILE, read_evidence, write_evidence
 from palpate.report.page import read_report
 from palpate.report.rows import DepthRow, Report
 from palpate.run.processes import read_processes

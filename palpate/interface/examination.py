@@ -16,7 +16,7 @@ import pandas as pd
 from palpate.environment import FIXED
 from palpate.interface.assessment import StiffnessMap, findings_frame, findings_html, html_of
 from palpate.interface.scenarios import scenario as scenario_of
-from palpate.report.archive import Evidence, read_evidence
+from palpate.report.evidence import Evidence, read_evidence
 from palpate.report.page import FILE as PAGE, read_report
 from palpate.report.results import clean_world_note, scores_text
 from palpate.report.rows import Report

@@ -60,7 +60,7 @@ def assess(
 
 def write_assessed(folder: Path, recording: PalpationRecording, gathered: Collected) -> tuple[Report, Path]:
     """Write the results of a recording into a folder, as those of a run; return report and page."""
-    from palpate.recording.faults import Remedy
+    from palpate.recording.recording import Remedy
     from palpate.report.page import write_page  # its figures take memory that the assessment needs before
     from palpate.report.results import write_results
     from palpate.report.rows import FaultRow, RecordedRow

@@ -10,13 +10,22 @@ from scipy.ndimage import find_objects, label, median_filter
 from scipy.spatial import cKDTree
 
 from palpate.recording.contacts import contacts_of_probes, contacts_over_time, probes
-from palpate.recording.faults import Fault, FaultCode, Remedy, is_refused
 from palpate.recording.mapping import Mapping, MappingError, read_mapping
 from palpate.recording.motion import Axis, blocks, pressing_axis
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, move_to_mapped, read_table
-from palpate.recording.recording import Contact, ContactKind, PalpationRecording, implied_young, loading, width
-from palpate.report.archive import FILE, read_evidence
-from palpate.report.evidence import columns_of, points, xyz
+from palpate.recording.recording import (
+    Contact,
+    ContactKind,
+    Fault,
+    FaultCode,
+    PalpationRecording,
+    Remedy,
+    implied_young,
+    is_refused,
+    loading,
+    width,
+)
+from palpate.report.evidence import FILE, columns_of, points, read_evidence, xyz
 from palpate_assessment.calibration import load_calibration
 from palpate_bus.messages import NS, nanoseconds
 from palpate_models.numerics.frames import Array, Mask, apply, inverse, matrix

@@ -1,21 +1,45 @@
-"""Collected messages as arrays, for scores, report and figures."""
+"""A run's messages: written to and read from its results folder, and as arrays, for scores, report and figures.
 
-from collections.abc import Iterable
+evidence.mcap has the messages that the conductor collected and, as an attachment, the truth of a simulated run. The report is
+built from it, with or without a recording of the whole run. A run that was killed has no evidence.mcap; then the same messages
+are read from its recording.
+"""
+
+import io
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby, pairwise
 from math import hypot
 from operator import attrgetter
-from typing import Any, Final
+from pathlib import Path
+from time import sleep, time
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
+from palpate.replay.golden import rerun, write_recording
 from palpate.report.scoring import Map, Truth
 from palpate.truth.pressed import Felt, Pressed, Touched, TrueBody, TrueSurface
-from palpate_bus.messages import NS, StiffnessMap, nanoseconds
+from palpate_bus.contract import CONDUCTOR, contract
+from palpate_bus.mcap_records import BROKEN, RecordingError
+from palpate_bus.messages import NS, StiffnessMap, codec, nanoseconds
 from palpate_bus.messages.geometry import pose_matrix
+from palpate_bus.recordings import RecordedMessage, Recording, open_recording
+from palpate_bus.runs.announcement import live_runs
+from palpate_bus.runs.run_folder import in_use
+from palpate_bus.settings import RECORDING
+from palpate_conductor.collector import Collected, Collector
+from palpate_errors import UserError, restate
+from palpate_inputs import InputFile, read_arrays, read_json
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.patient.motion import BodyMotion
-from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
+from palpate_recorder.recover import salvage
 
 xyz: Final = attrgetter("x", "y", "z")
 """Coordinates of a point or vector of a message."""
@@ -125,3 +149,245 @@ _CONTACT: Final = np.dtype([
 ])  # fmt: skip
 """Measured, true and wanted depth [m]; whether depth yields to the force limit; estimated and true place on the rest surface
 under the indenter [m], in the registered and in the true A."""
+
+
+FILE: Final = "evidence.mcap"
+_TRUTH: Final = "truth.npz"
+"""Attachment: name of the run, touched places, forces of the pressed copy of the patient."""
+_TOPICS: Final = {
+    "exam_states": "exam/state",
+    "indentation": "truth/indentation",
+    "motions": "perception/motion",
+    "samples": "assessment/samples",
+    "status_changes": "robot/status",
+    "supervisor": "supervisor/state",
+    "phantom": "truth/phantom",
+    "surface": "perception/surface",
+    "correction": "exam/correction",
+    "targets": "perception/targets",
+    "stiffness_map": "assessment/map",
+    "findings": "assessment/findings",
+}
+"""Topic of each field of `Collected`."""
+_MAGIC: Final = b"\x89MCAP0\r\n"
+"""First and last bytes of a complete file."""
+_STILL_S: Final = 3.0
+"""A recording that has not grown for this long is complete: its recorder writes every simulated second."""
+
+
+class EvidenceError(UserError):
+    """A folder without a readable run. Names the file and what to do."""
+
+
+class NothingRecordedError(EvidenceError):
+    """An interrupted run of which nothing was recorded."""
+
+
+class Event(NamedTuple):
+    """A message of the examination or a change of the driver, for the reader of a report."""
+
+    time_s: float
+    """Simulated."""
+    source: str
+    """exam or driver."""
+    text: str
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The collected messages of a run and its truth, for its report; n exam states and m true contacts, in order of time."""
+
+    collected: Collected
+    touched: Touched
+    """Estimated and true places on the skin under the indenter."""
+    pressed: Pressed | None
+    """Forces of a pressed copy of the patient; None if none can be made."""
+    run: str = ""
+    """Name of the run."""
+
+    @cached_property
+    def states(self) -> Any:
+        """The exam states as a record array, shape (n,): time [s], phase (ExamState.PHASE_*), depth and setpoint [m], tared
+        normal force [N], flags, targets skipped and in all.
+        """
+        rows = ((nanoseconds(s.header.stamp) / NS, *_values(s)) for s in self.collected.exam_states)
+        return np.fromiter(rows, [("time", "f8"), *((name, kind) for name, _, kind in _STATE)]).view(np.recarray)
+
+    @cached_property
+    def contacts(self) -> Any:
+        """The true contact as a record array, shape (m,): time [s], depth [m], normal force [N]."""
+        rows = ((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in self.collected.indentation)
+        return np.fromiter(rows, [("time", "f8"), ("depth", "f8"), ("force", "f8")]).view(np.recarray)
+
+    @property
+    def target_count(self) -> int:
+        """Number of targets."""
+        return int(self.states.target_count.max(initial=0))
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """Every new message of the examination and every change of the driver, in order of time."""
+        events = []
+        for text, states in groupby(self.collected.exam_states, key=attrgetter("message")):
+            if text:
+                events.append(Event(nanoseconds(next(states).header.stamp) / NS, "exam", text))
+        for status in self.collected.status_changes:
+            text = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
+            events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", text))
+        return sorted(events, key=attrgetter("time_s"))
+
+    def phases(self) -> list[tuple[int, float, float]]:
+        """Return phase, begin and end [s] of each phase, in order."""
+        time, phase = self.states.time, self.states.phase
+        starts = [0, *(np.flatnonzero(np.diff(phase.astype(int))) + 1), len(phase)]
+        return [(int(phase[a]), float(time[a]), float(time[b - 1])) for a, b in pairwise(starts) if b > a]
+
+
+_STATE: Final = (
+    ("phase", "phase", "u1"),
+    ("depth", "depth", "f8"),
+    ("setpoint", "depth_setpoint", "f8"),
+    ("force", "normal_force", "f8"),
+    *((flag, flag, "?") for flag in ("in_contact", "steady", "force_limited")),
+    ("skipped", "targets_skipped", "u4"),
+    ("target_count", "target_count", "u4"),
+)
+"""Columns of the exam states: name, field and type."""
+_values: Final = attrgetter(*(field for _, field, _ in _STATE))
+
+
+def write_evidence(
+    path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
+) -> None:
+    """Write the collected messages of the run named `run`, complete or not, and its truth if known."""
+    known: dict[str, Any] = {"run": np.array(run)}
+    if touched is not None:
+        known |= {"touched_believed": touched.believed, "touched_true": touched.true}
+    if pressed is not None:
+        known |= {f"pressed_{name}": values for name, values in pressed._asdict().items()}
+    truth = io.BytesIO()
+    np.savez_compressed(truth, **known)
+    messages = sorted(_messages(c), key=attrgetter("stamp"))
+    write_recording(path, contract(), messages, {_TRUTH: ("application/octet-stream", truth.getvalue())})
+
+
+def _messages(c: Collected) -> Iterator[RecordedMessage]:
+    """Yield all collected messages, topic by topic."""
+    for field, topic in _TOPICS.items():
+        encode = codec.encoder(contract().topics[topic].type)
+        kept = getattr(c, field)
+        messages = () if kept is None else kept if field in _SEQUENCES else (kept,)
+        for number, message in enumerate(messages, start=1):
+            # the phantom is sent once, at the start; samples of a resumed run are stamped before it
+            stamp = max(nanoseconds(message.header.stamp), 0) if hasattr(message, "header") else 0
+            yield RecordedMessage(stamp, topic, encode(message), number)
+
+
+_SEQUENCES: Final = ("exam_states", "indentation", "motions", "samples", "status_changes")
+
+
+def _read_collected(evidence: Recording) -> Collected:
+    """Return the messages that `_messages` wrote."""
+    evidence.check(contract(), list(evidence.types))
+    fields = {topic: field for field, topic in _TOPICS.items()}
+    kept: dict[str, Any] = {field: [] for field in _SEQUENCES}
+    for message in evidence.messages(list(evidence.types)):
+        field = fields[message.topic]
+        decoded = codec.decode(message.payload, contract().topics[message.topic].type)
+        if field in _SEQUENCES:
+            kept[field].append(decoded)
+        else:
+            kept[field] = decoded
+    return Collected(**kept)
+
+
+def collect(recording: Recording) -> Collected:
+    """Return the messages of a recording that a conductor collects. Raises RecordingError."""
+    collector = Collector()
+    end = tick_after(recording.last, collector.role)
+    for _ in rerun(collector, contract(), inputs(recording, collector.role), end):
+        pass
+    return collector.collected
+
+
+def tick_after(t: int, role: str) -> int:
+    """Return the first tick [ns] of a role after `t` [ns]."""
+    period = contract().roles[role].period
+    return t - t % period + period
+
+
+def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
+    """Return the recorded inputs of a role, in order. Raises RecordingError."""
+    topics = [topic.name for topic, _ in contract().inputs(role) if topic.name in recording.types]
+    recording.check(contract(), topics)
+    return recording.messages(topics)
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """Return the evidence of the run in `folder`. Raises EvidenceError."""
+    path = folder / FILE
+    if not path.is_file():
+        raise EvidenceError(f"{path} is not there: give the results folder; after a loss of the conductor with --recover")
+    try:
+        with InputFile(path, EvidenceError) as stream:
+            reader = make_reader(stream)
+            attached = {a.name: a.data for a in reader.iter_attachments()}
+            summary = reader.get_summary()
+        known = read_arrays(attached[_TRUTH], path, EvidenceError)
+        collected = _read_collected(open_recording(path)) if summary is not None and summary.channels else Collected()
+        nowhere = np.empty((0, 3))
+        touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
+        named = {name: known[f"pressed_{name}"] for name in Pressed._fields if f"pressed_{name}" in known}
+        return Evidence(collected, touched, Pressed(**named) if named else None, str(known["run"]))
+    except (KeyError, TypeError) as error:
+        raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
+    except (OSError, *BROKEN) as error:
+        raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
+
+
+def read_completed(folder: Path) -> dict[str, Any] | None:
+    """Return report.json of a completed run with its evidence; None if there is none."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        report: dict[str, Any] = read_json(folder / "report.json")
+        with (folder / FILE).open("rb") as file:
+            file.seek(-len(_MAGIC), io.SEEK_END)
+            return report if report["failure"] is None and file.read() == _MAGIC else None
+    return None
+
+
+class InterruptedRun(NamedTuple):
+    """A run without results or with those of a failure."""
+
+    folder: Path
+    scenario: Scenario
+    recording: Recording
+    collected: Collected
+
+
+def read_interrupted(folder: Path) -> InterruptedRun:
+    """Read the folder of a run.
+
+    Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
+    """
+    with restate(OSError, EvidenceError, f"{folder}: cannot be read"):
+        if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live_runs()):
+            raise EvidenceError(f"{folder}: its run is still active; stop it first")
+    with restate((RecordingError, ScenarioError), EvidenceError, f"{folder}: nothing can be recovered"):
+        scenario = load_scenario(str(folder / "scenario.yaml"))
+        recording = _recording(folder)
+        collected = _read_collected(recording) if recording.path.name == FILE else collect(recording)
+        return InterruptedRun(folder, scenario, recording, collected)
+
+
+def _recording(run: Path) -> Recording:
+    """Return the recording of a run, which may be incomplete or damaged, or else its evidence."""
+    folder = run / RECORDING
+    parts = sorted(folder.glob("*.mcap"))
+    if not parts:
+        if (run / FILE).is_file():
+            return open_recording(run / FILE)
+        raise NothingRecordedError(f"{run}: nothing can be recovered: it has no recording and no {FILE}")
+    while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < _STILL_S:
+        sleep(0.1)  # the recorder outlives the conductor by some seconds
+    with restate((OSError, ValueError), NothingRecordedError, f"{folder}: nothing can be recovered"):
+        return salvage(folder, [topic.name for role in (CONDUCTOR, "assessment") for topic, _ in contract().inputs(role)])

@@ -15,8 +15,7 @@ from markupsafe import Markup
 from pydantic import ValidationError
 
 from palpate.report import page_figures, rows
-from palpate.report.archive import FILE as EVIDENCE, Evidence, EvidenceError, read_evidence
-from palpate.report.evidence import body_of, felt_truth
+from palpate.report.evidence import FILE as EVIDENCE, Evidence, EvidenceError, body_of, felt_truth, read_evidence
 from palpate.report.files import write_text
 from palpate.report.results import clean_world_note, describe_unassessed
 from palpate.report.rows import FindingRow, Report

@@ -17,8 +17,7 @@ import numpy as np
 from palpate.apart import run_guarded, shared_numbers
 from palpate.environment import set_environment
 from palpate.replay.golden import rerun
-from palpate.report import archive
-from palpate.report.evidence import points
+from palpate.report import evidence
 from palpate_assessment.sampling import columns
 from palpate_assessment.service import AssessmentService
 from palpate_bus.contract import CONDUCTOR, contract
@@ -49,8 +48,8 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
 
     Raises EvidenceError if the run is still active, is complete, or has no recording.
     """
-    if archive.read_completed(folder) is not None:
-        raise archive.EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
+    if evidence.read_completed(folder) is not None:
+        raise evidence.EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
     *continued, run = _runs(folder)
     note = ""
     checkpoint = _last_checkpoint(continued) if continued else None
@@ -62,7 +61,7 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
             collected.stiffness_map = assessed.get("assessment/map", collected.stiffness_map)
             collected.findings = assessed.get("assessment/findings", collected.findings)
         except RecordingError as error:
-            raise archive.EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
+            raise evidence.EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
         except PalpateError as error:  # a user-defined assessment, which may have ended the run
             note = f"; the assessment could not finish: {error}"
     last = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
@@ -79,7 +78,7 @@ def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
     )
 
 
-def _assess(run: archive.InterruptedRun) -> dict[str, Any]:
+def _assess(run: evidence.InterruptedRun) -> dict[str, Any]:
     """Return the last message of each topic of the assessment, run apart on the recorded examination.
 
     To it the examination was aborted where the recording ends. Raises RecordingError, or PalpateError if it fails.
@@ -88,13 +87,13 @@ def _assess(run: archive.InterruptedRun) -> dict[str, Any]:
     if exam is None:
         return {}
     row = contract().topics["exam/state"]
-    end = archive.tick_after(recording.last, "assessment")
+    end = evidence.tick_after(recording.last, "assessment")
     aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
     over = RecordedMessage(end, row.name, aborted, len(run.collected.exam_states) + 1)
     reached = shared_numbers()
 
     def received() -> Iterator[RecordedMessage]:
-        for reached[0], message in enumerate(chain(archive.inputs(recording, "assessment"), [over])):
+        for reached[0], message in enumerate(chain(evidence.inputs(recording, "assessment"), [over])):
             yield message
 
     def work() -> dict[str, bytes]:  # all messages at once: earlier maps are not needed
@@ -134,17 +133,17 @@ def resumption(folder: Path) -> Resumption:
     """
     while _holds_run(folder / FOLDER):
         folder /= FOLDER
-    if archive.read_completed(folder) is not None:
-        raise archive.EvidenceError(f"--resume {folder}: its run was completed")
+    if evidence.read_completed(folder) is not None:
+        raise evidence.EvidenceError(f"--resume {folder}: its run was completed")
     runs = _runs(folder)
     if any(state.patient_moved for run in runs for state in run.collected.exam_states):
         moved = "the patient moved during the examination, so its samples do not fit a new scan"
-        raise archive.EvidenceError(f"--resume {folder}: {moved}; start a new run")
+        raise evidence.EvidenceError(f"--resume {folder}: {moved}; start a new run")
     reached = _last_checkpoint(runs)
     if not len(reached.felt.time):
-        raise archive.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
+        raise evidence.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
-        raise archive.EvidenceError(f"--resume {folder}: all targets were reached; see palpate report {folder} --recover")
+        raise evidence.EvidenceError(f"--resume {folder}: all targets were reached; see palpate report {folder} --recover")
     lost = tuple(text for run in runs for text in run.recording.damage)
     return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs), lost)
 
@@ -154,8 +153,8 @@ def _holds_run(folder: Path) -> bool:
     if not (folder / "scenario.yaml").is_file():
         return False
     try:
-        return archive.read_completed(folder) is not None or archive.read_interrupted(folder) is not None
-    except archive.NothingRecordedError:
+        return evidence.read_completed(folder) is not None or evidence.read_interrupted(folder) is not None
+    except evidence.NothingRecordedError:
         return False
 
 
@@ -172,15 +171,15 @@ def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
             yield
 
 
-def _runs(folder: Path) -> list[archive.InterruptedRun]:
+def _runs(folder: Path) -> list[evidence.InterruptedRun]:
     """Return the run in a folder, preceded by those that it continued."""
     folders = [folder.resolve()]
     while folders[0].name == FOLDER and (folders[0].parent / "scenario.yaml").is_file():
         folders.insert(0, folders[0].parent)
-    return [archive.read_interrupted(one) for one in folders]
+    return [evidence.read_interrupted(one) for one in folders]
 
 
-def _last_checkpoint(runs: list[archive.InterruptedRun]) -> Checkpoint:
+def _last_checkpoint(runs: list[evidence.InterruptedRun]) -> Checkpoint:
     """Return the checkpoint at the end of a sequence of runs, each of which continued its predecessor."""
     reached: Checkpoint | None = None
     for run in runs:
@@ -189,7 +188,7 @@ def _last_checkpoint(runs: list[archive.InterruptedRun]) -> Checkpoint:
     return reached
 
 
-def _extend(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+def _extend(run: evidence.InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
     """Return the checkpoint at the end of a run that continued from `earlier`: its samples, remaining targets and surface."""
     known, c = exam_input(run.scenario), run.collected
     assessment = AssessmentService(known, earlier)
@@ -204,7 +203,7 @@ def _extend(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoi
     if c.surface is None or c.targets is None:  # before the first view of the surface
         surface, left = (np.empty((0, 3)), np.empty((0, 2))) if earlier is None else (earlier.surface, earlier.left)
     else:
-        surface = apply(X_AW, points(c.surface))
+        surface = apply(X_AW, evidence.points(c.surface))
         targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
         wanted = range(len(targets)) if earlier is None else earlier.remaining_targets(targets, run.scenario.exam.spacing_m)
         left = targets[[i for i in sorted(wanted) if i >= c.targets_reached - 1]]  # the stroke of the last one starts there

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.apart import run_guarded
-from palpate.report import archive, evidence, rows, scoring
+from palpate.report import evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, Scores, TruthRow
 from palpate.truth.pressed import Pressed, Touched, TrueBody, press_patient
@@ -152,7 +152,7 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded:
     samples = evidence.sample_columns(c.samples)
     write_samples(folder / "samples.csv", samples, run)
     touched = None if known.contact is None else Touched(known.contact.believed, known.contact.touched)
-    archive.write_evidence(folder / archive.FILE, c, touched, None if known.felt is None else known.felt.felt.pressed, run)
+    evidence.write_evidence(folder / evidence.FILE, c, touched, None if known.felt is None else known.felt.felt.pressed, run)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     if c.stiffness_map is not None:
         title = f"{scenario.name}, seed {scenario.seed}" if recorded is None else scenario.name

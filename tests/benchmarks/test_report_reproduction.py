@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from palpate.exam_state import exam_state
-from palpate.report.archive import Evidence, read_completed, write_evidence
+from palpate.report.evidence import Evidence, read_completed, write_evidence
 from palpate.truth.pressed import Touched
 from palpate_bus.messages import NS
 from palpate_conductor.collector import Collected

@@ -12,7 +12,7 @@ import pytest
 from conductor_messages import SCENARIO, collected, findings, result, stiffness_map
 from matplotlib.image import imread
 
-from palpate.report import archive
+from palpate.report import evidence
 from palpate.report.figures import Drawing, draw_map
 from palpate.report.page import read_report, verdict, write_page
 from palpate.report.results import Known, assemble, truth_of_run, write_results
@@ -133,14 +133,14 @@ def test_only_touched_tissue_is_assessed() -> None:
 
 def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
     c = collected(measured_error=0.0002)
-    archive.write_evidence(tmp_path / archive.FILE, c)
-    evidence = archive.read_evidence(tmp_path)
-    assert evidence.states.depth == pytest.approx([s.depth for s in c.exam_states])
-    assert evidence.contacts.force == pytest.approx([m.normal_force for m in c.indentation])
-    assert evidence.states.skipped[-1] == 2
-    assert [f.quadrant for f in evidence.collected.findings.findings] == [f.quadrant for f in findings().findings]
-    assert np.array_equal(evidence.collected.stiffness_map.stiffness, c.stiffness_map.stiffness)
-    assert evidence.phases() == [(5, 0.0, pytest.approx(0.99))]
+    evidence.write_evidence(tmp_path / evidence.FILE, c)
+    kept = evidence.read_evidence(tmp_path)
+    assert kept.states.depth == pytest.approx([s.depth for s in c.exam_states])
+    assert kept.contacts.force == pytest.approx([m.normal_force for m in c.indentation])
+    assert kept.states.skipped[-1] == 2
+    assert [f.quadrant for f in kept.collected.findings.findings] == [f.quadrant for f in findings().findings]
+    assert np.array_equal(kept.collected.stiffness_map.stiffness, c.stiffness_map.stiffness)
+    assert kept.phases() == [(5, 0.0, pytest.approx(0.99))]
 
 
 @pytest.mark.parametrize(
@@ -159,14 +159,14 @@ def test_a_report_of_another_hand_is_refused_by_field(field: str, value: Any, sa
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
-    with pytest.raises(archive.EvidenceError, match=r"report\.json is not there: give the results folder"):
+    with pytest.raises(evidence.EvidenceError, match=r"report\.json is not there: give the results folder"):
         write_page(tmp_path)
     (tmp_path / "report.json").write_text('{"seed": 1}', encoding="utf-8")
-    with pytest.raises(archive.EvidenceError, match=r"report\.json .*scenario: Field required"):
+    with pytest.raises(evidence.EvidenceError, match=r"report\.json .*scenario: Field required"):
         write_page(tmp_path)
-    (tmp_path / archive.FILE).write_bytes(b"not an archive")
-    with pytest.raises(archive.EvidenceError, match=r"evidence\.mcap cannot be read"):
-        archive.read_evidence(tmp_path)
+    (tmp_path / evidence.FILE).write_bytes(b"not an archive")
+    with pytest.raises(evidence.EvidenceError, match=r"evidence\.mcap cannot be read"):
+        evidence.read_evidence(tmp_path)
 
 
 @pytest.fixture(scope="module")

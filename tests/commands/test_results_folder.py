@@ -15,7 +15,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.report.archive import EvidenceError, read_evidence
+from palpate.report.evidence import EvidenceError, read_evidence
 from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results

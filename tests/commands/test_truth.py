@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.truth import pressed
-from palpate.truth.felt import Felt
-from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface, press_patient, resting_tissue
+from palpate.truth.pressed import Felt, Pressed, Touched, TrueBody, TrueSurface, press_patient, resting_tissue
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Lesion
 from palpate_models.scenario.load import load_scenario

@@ -9,11 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate.interface.assessment import assess
-from palpate.recording.faults import FaultCode
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
 from palpate.recording.readings import Readings, from_table
-from palpate.recording.recording import PalpationRecording
+from palpate.recording.recording import FaultCode, PalpationRecording
 from palpate_assessment.places import places_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"

@@ -67,7 +67,7 @@ def suite(rig: Rig) -> None:
     ok = state is not None and state.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_HELD) and STOP_REASON in state.message
     got = "no state" if state is None else f"phase {state.phase}: {state.message}"
     rig.expect("an operator's stop ends or holds the examination, with the operator's reason", ok, "aborted or held", got)
-    q = np.array([item.message.joint_position for item in after[SETPOINT][SETTLE_SETPOINTS :]])
+    q = np.array([item.message.joint_position for item in after[SETPOINT][SETTLE_SETPOINTS:]])
     if rig.expect("set-points continue after the stop", len(q) > 1, "100 Hz", len(q)):
         rig.below("and stand still", np.max(np.abs(q - q[0])), 0.05, "rad in a second")
     rig.section("silence")
