@@ -11,7 +11,7 @@ import pytest
 from palpate.fuzz.bus_readers import Broken, FuzzTarget
 from palpate.fuzz.fuzz import Find, FuzzPlan, attempt, campaign, choose
 from palpate_bus.messages import RecordChunk, codec
-from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.member import CHUNK_TYPE, unpack_chunk
 from palpate_errors import UserError
 from palpate_models.scenario.load import ScenarioError, load_scenario
 

@@ -14,8 +14,8 @@ from toy_services import joint_state
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import MS, RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
+from palpate_bus.runtime.member import ChunkWriter, unpack_chunk
 from palpate_bus.runtime.observer import RecorderNode
-from palpate_bus.runtime.output import ChunkWriter, unpack_chunk
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import ReceivedSample
 

@@ -13,7 +13,7 @@ from rosbags.interfaces import Nodetype
 from palpate_bus.contract import contract
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.messages.typestore import array_dtype
-from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.member import CHUNK_TYPE, unpack_chunk
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.liveliness import parse_token
 from palpate_bus.wire.rmw import AttachmentWriter, WireError, parse_key, topic_key, unpack

@@ -10,8 +10,7 @@ from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.runtime.conductor_link import TIMES, ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.lockstep import NEVER, Outgoing, Stepper
-from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.output import ServiceOutput
+from palpate_bus.runtime.member import Member, ServiceOutput
 
 
 class Seat:

@@ -18,8 +18,7 @@ from palpate_bus.contract.port_check import PortCheck, RefusedMessage
 from palpate_bus.messages import RunControl, ServiceReport, codec, nanoseconds
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Packet, Stepper
-from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.member import CHUNK_TYPE, Member, unpack_chunk
 from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
