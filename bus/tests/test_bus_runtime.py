@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections import Counter
 from time import time_ns
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -12,14 +13,14 @@ import pytest
 from toy_services import TOYS, joint_state
 
 from palpate_bus.contract import Edge, contract
-from palpate_bus.messages import MS, RunControl, codec
+from palpate_bus.messages import MS, NS, RunControl, codec
 from palpate_bus.run import in_background
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet
+from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet, Stepper
 from palpate_bus.runtime.wallclock import BIN_NS, WallClockNode, age_ms
 
-ROW = contract().topics["joint_states"]
+ROW, ROBOT_STATUS = contract().topics["joint_states"], contract().topics["robot/status"]
 
 
 def buffer(payload: bytes) -> InputBuffer:
@@ -81,6 +82,27 @@ def test_a_replacement_starts_once_it_has_named_its_process() -> None:
     assert node._link.poll.call_count == 4
     (report,) = node._seat.reports.send.call_args_list
     assert report.kwargs["detail"]["pid"] == os.getpid()
+
+
+def test_a_late_driver_of_hardware_sends_its_status_in_time() -> None:
+    """It skips to the present tick, which is rarely a multiple of the status's period: there were gaps of 170 ms."""
+    node = WallClockNode.__new__(WallClockNode)
+    node._stepper = Stepper(TOYS["robot"](), contract(), strict=False)
+    node._seat, node._link, node._number, node._end, node._rate = mock.Mock(), mock.Mock(), Counter(), NS, 1.0
+    node._seat.service.catches_up, node._link.poll.return_value = False, None
+    node._receive = node._note_lost_conductor = mock.Mock()  # type: ignore[method-assign]
+    node._await_inputs, clock, stepped = lambda: 0, [0], []  # type: ignore[method-assign]
+    node._run_time = lambda: clock[0]  # type: ignore[method-assign]
+
+    def step(_: Any, t: int) -> None:
+        stepped.append(t)
+        clock[0] += (21 + len(stepped) % 17) * MS // 10
+
+    node._step_and_send = step  # type: ignore[assignment]
+    node._loop()
+    sent = np.array([t for t in stepped if t % ROBOT_STATUS.period == 0])
+    assert np.diff(sent).max() <= 2 * ROBOT_STATUS.period
+    assert np.diff(stepped).min() > 0
 
 
 def test_ages_are_those_of_the_messages_to_within_a_bin() -> None:

@@ -3,8 +3,9 @@
 `t` counts periods since the common start, with absolute deadlines, so that no drift builds up. A late step is counted as an
 overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick by tick, unless it is later
 than `TIMES.catch_up_ns` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps
-must stay on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks
-the contract is dropped where it is sent or received, so that its readers act as on silence.
+must stay on the common clock; or to one missed shortly before at which a slower topic is due, which would starve. No service
+waits for another; expiry protects the readers of a late sample. A message that breaks the contract is dropped where it is sent
+or received, so that its readers act as on silence.
 
 On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
 """
@@ -140,6 +141,8 @@ class WallClockNode(Node):
 
     def _loop(self) -> None:
         period = self._stepper.role.period
+        slower = [port.period for port in self._stepper.ports.values() if port.topic.periodic and port.period > period]
+        grid = min(slower, default=period)
         catch_up = TIMES.catch_up_ns if self._stepper.role.critical and self._seat.service.catches_up else period
         t = self._await_inputs()
         while self._end is None or t <= self._end:
@@ -149,7 +152,9 @@ class WallClockNode(Node):
             elif late > period:
                 self._number["overruns"] += 1
                 if late > catch_up:
-                    t += late // period * period
+                    present = t + late // period * period
+                    due = present // grid * grid
+                    t = due if due >= t else present
                     self._number["skips"] += 1
             self._receive(t)
             self._seat.output.record(self._step_and_send(self._seat, t), t)

@@ -201,7 +201,8 @@ class HardwareService(Service):
         """True while the newest command may push."""
         self._fault: str | None = None
         """Fault of the arm or the F/T sensor; no command is accepted with one."""
-        self._sums, self._summed = np.zeros(6 + 2 * n + len(measured.torque)), 0
+        self._readings: list[Array] = []
+        """Positions, velocities, wrench and torques of the states since the last status, without a gap."""
         self._mean_wrench = np.zeros(6)
         self._states = self._commands = 0
         self._peak_force = 0.0
@@ -265,7 +266,7 @@ class HardwareService(Service):
         since = self._commanding_since
         if self._port.rivals() and since is not None and t - since > TAKE_OVER_NS:
             self._driver.hold(t, HoldCause.DEVICE, "another process (watchdog?) commands the arm")
-        fresh = False
+        fresh, before = False, self._arm.received
         for state in self._port.states():
             fresh = self._arm.update(t, state) or fresh
         for reading in self._port.wrenches():
@@ -276,8 +277,9 @@ class HardwareService(Service):
             self._wrench, self._wrench_at = self._wrench_on_sensor(values), t
         if fresh:
             self._states += 1
-            self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque))
-            self._summed += 1
+            if before is not None and t - before > STATUS_PERIOD:
+                self._readings.clear()
+            self._readings.append(np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque)))
         return fresh
 
     def _wrench_on_sensor(self, reading: Array) -> Array:
@@ -362,9 +364,9 @@ class HardwareService(Service):
     def _status(self, t: int) -> Message:
         driver, n = self._driver, len(self._names)
         q = v = torque = np.zeros(0)
-        if self._summed:
-            q, v, self._mean_wrench, torque = np.split(self._sums / self._summed, (n, 2 * n, 2 * n + 6))
-            self._sums, self._summed = np.zeros_like(self._sums), 0
+        if self._readings:
+            q, v, self._mean_wrench, torque = np.split(np.mean(self._readings, axis=0), (n, 2 * n, 2 * n + 6))
+            self._readings.clear()
         cause, reason = driver.cause, driver.reason
         if not driver.held and self._fault is not None:
             cause, reason = HoldCause.DEVICE, self._fault
