@@ -374,6 +374,7 @@ class RobotStatus:
     CAUSE_FORCE_LIMIT: ClassVar[int]
     CAUSE_STOP_REQUESTED: ClassVar[int]
     CAUSE_DEVICE: ClassVar[int]
+    CAUSE_SUPERVISOR: ClassVar[int]
     header: Header
     mode: int
     cause: int

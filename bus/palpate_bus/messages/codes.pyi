@@ -25,6 +25,7 @@ class HoldCause(IntEnum):
     FORCE_LIMIT = 7
     STOP_REQUESTED = 8
     DEVICE = 9
+    SUPERVISOR = 10
 
 class Phase(IntEnum):
     HOME = 0

@@ -87,8 +87,11 @@ class Driver:
         return self.mode is DriverMode.SAFE_HOLD
 
     def hold(self, t: int, cause: HoldCause, reason: str, culprit: str = "") -> None:
-        """Latch a safe hold at `t` [ns]. The first cause is kept until the release. `culprit`: role or topic at fault."""
-        if not self.held:
+        """Latch a safe hold at `t` [ns]. The first cause is kept until the release, unless an operator requests a stop.
+
+        `culprit`: role or topic at fault.
+        """
+        if not self.held or cause is HoldCause.STOP_REQUESTED:
             self.mode, self.cause, self.reason, self.culprit = DriverMode.SAFE_HOLD, cause, reason, culprit
             self._brake = TUNING.brake_ticks
             self.holds.append((t, cause, reason))

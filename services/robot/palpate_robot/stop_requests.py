@@ -40,14 +40,15 @@ class StopRequests:
         self._releases = 0  # granted by the supervisor
 
     def apply(self, t: int, inbox: Inbox) -> None:
-        """Releases, then holds, at `t` [ns]: a release never undoes a stop of the same tick."""
+        """Releases, then holds, at `t` [ns]: a release undoes neither a stop of the same tick nor one after it was granted."""
         for message in inbox.new("supervisor/state"):
-            if message.releases > self._releases:
+            held_at = self._driver.holds[-1][0] if self._driver.holds else 0
+            if message.releases > self._releases and nanoseconds(message.header.stamp) >= held_at:
                 self._driver.release(t)
             self._releases = message.releases
             if message.level == SupervisorState.LEVEL_EMERGENCY:
                 reason = f"emergency stop of the supervisor: {message.reason}"
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, reason, message.culprit)
+                self._driver.hold(t, HoldCause.SUPERVISOR, reason, message.culprit)
         for message in inbox.new("operator/request"):
             if message.request == OperatorRequest.STOP:
                 self._driver.hold(t, HoldCause.STOP_REQUESTED, f"stopped by the operator: {message.reason}")

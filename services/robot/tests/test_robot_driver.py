@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import contract
+from palpate_bus.messages import OperatorRequest, SupervisorState, header
 from palpate_bus.messages.codes import DriverMode, HoldCause
+from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.robot.lbr import ARM
 from palpate_robot.driver import TUNING, Command, Driver
+from palpate_robot.stop_requests import StopRequests
 
 MS = 1_000_000
 STILL = np.zeros(7)
@@ -136,7 +139,7 @@ def test_hold_is_latched_and_keeps_its_first_cause(active: Driver) -> None:
     _update(active, 2 * MS, _command(MS), force=50.0)
     for tick in range(3, 200):
         assert not _update(active, tick * MS, _command((tick - 1) * MS)).any()
-    active.hold(200 * MS, HoldCause.STOP_REQUESTED, "late")
+    active.hold(200 * MS, HoldCause.SUPERVISOR, "late")
     assert active.cause is HoldCause.FORCE_LIMIT
     assert len(active.holds) == 1
 
@@ -150,6 +153,18 @@ def test_release_waits_for_a_command_sent_after_it(active: Driver) -> None:
     assert active.mode is DriverMode.IDLE
     assert _update(active, 5 * MS, _command(4 * MS)).any()
     assert active.mode is DriverMode.ACTIVE
+
+
+def test_a_release_undoes_no_stop_of_after_it_was_granted(active: Driver) -> None:
+    requests, inbox = StopRequests(active), HandInbox()
+    active.hold(2 * MS, HoldCause.SUPERVISOR, "41 N")
+    inbox.events["operator/request"] = [OperatorRequest(header(5 * MS), OperatorRequest.STOP, "it hurts")]
+    requests.apply(6 * MS, inbox)
+    assert active.cause is HoldCause.STOP_REQUESTED, "the supervisor may not have received it, and releases others by itself"
+    for releases, granted, held in ((1, 5 * MS, True), (1, 15 * MS, True), (2, 25 * MS, False)):
+        inbox.events["supervisor/state"] = [SupervisorState(header(granted), 0, 0, "", releases, 0.0, 0.0, 0.0, 0, "", 0.0)]
+        requests.apply(granted + 10 * MS, inbox)
+        assert active.held is held
 
 
 def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None:

@@ -27,11 +27,11 @@ RECOVERABLE: Final = {StopCause.DEPTH: TUNING.further_m, StopCause.WORKSPACE: TU
 """Causes that only motion can end. After a release they are ignored until they are over or have grown by this much."""
 RECOVERABLE_STIFF: Final = RECOVERABLE | {StopCause.FORCE: TUNING.further_n}
 """As `RECOVERABLE`, for an arm that takes positions: it does not yield in a hold, so a force stays."""
-_HARMLESS_HOLDS = (HoldCause.COMMAND_EXPIRED, HoldCause.FORCE_LIMIT, HoldCause.STOP_REQUESTED)
+_HARMLESS_HOLDS = (HoldCause.COMMAND_EXPIRED, HoldCause.FORCE_LIMIT, HoldCause.SUPERVISOR)
 HARMLESS = frozenset({(cause, HoldCause.NONE) for cause in (StopCause.FORCE, StopCause.SILENT)}) | {
     (StopCause.DRIVER, hold) for hold in _HARMLESS_HOLDS
 }
-"""Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""
+"""Causes, and causes of the driver's hold, that do no harm once over: a cough, a late message, a stop by the supervisor."""
 
 
 class Stop(NamedTuple):

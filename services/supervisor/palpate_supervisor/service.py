@@ -88,8 +88,12 @@ class SupervisorService(Service):
                 breaches.append(Breach(StopLevel.EMERGENCY, StopCause.INVALID, reason, culprit="operator/request"))
         for mesh in inbox.new("perception/surface"):
             breaches += self._take_surface(mesh)
-        if measured := inbox.new("robot/status"):  # several after a late step: the joints' force follows from each
+        if measured := list(inbox.new("robot/status")):  # several after a late step: the joints' force follows from each
             self._measured = [breach for status in measured for breach in self._measure(t, status)]
+            newest = measured[-1]
+            if newest.mode == RobotStatus.MODE_SAFE_HOLD:
+                held = f"safe hold of the driver: {newest.reason}"
+                self._measured += [Breach(StopLevel.EMERGENCY, StopCause.DRIVER, held, culprit=newest.culprit, hold=newest.cause)]
         breaches += self._measured  # valid until the next measurement
         for stated in inbox.new("exam/state"):
             skin_W = vector(stated.surface_point), vector(stated.surface_normal)
@@ -145,13 +149,9 @@ class SupervisorService(Service):
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
-        held = []
-        if status.mode == RobotStatus.MODE_SAFE_HOLD:
-            reason = f"safe hold of the driver: {status.reason}"
-            held.append(Breach(StopLevel.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
         if not len(status.position):  # the arm reports none
             self._agreement = MotionAgreement()
-            return held
+            return []
         # Arrays of messages are read-only, a different type for numba.
         measured = Measurement(
             np.array(status.position), np.array(status.velocity), wrench(status.wrench), np.array(status.measured_torque)
@@ -170,8 +170,7 @@ class SupervisorService(Service):
         self._depth = min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
         known = depth if above else None
         found = self._watch.judge(tool, known, stamp, t) + self._judge.judge(self._sense.comparison, known)
-        found += self._disagreeing
-        return found + held
+        return found + self._disagreeing
 
 
 def create(scenario: Scenario) -> SupervisorService:

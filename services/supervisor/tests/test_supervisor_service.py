@@ -215,12 +215,13 @@ def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop_sooner_if_the_
         (EMERGENCY, True),
         (DRIVER._replace(hold=RobotStatus.CAUSE_COMMAND_EXPIRED), True),
         (DRIVER._replace(hold=RobotStatus.CAUSE_VELOCITY_LIMIT), False),
+        (DRIVER._replace(hold=RobotStatus.CAUSE_STOP_REQUESTED), False),
         (DEPTH, False),
         (Breach(StopLevel.SOFT_STOP, StopCause.OPERATOR, "soft stop by the operator"), False),
     ],
 )
 def test_only_a_harmless_cause_that_is_over_is_released_alone_and_not_often(breach: Breach, alone: bool) -> None:
-    latch, over, held = Latch(), latch_module.TUNING.over_ns, DRIVER._replace(hold=RobotStatus.CAUSE_STOP_REQUESTED)
+    latch, over, held = Latch(), latch_module.TUNING.over_ns, DRIVER._replace(hold=RobotStatus.CAUSE_SUPERVISOR)
     later = [] if breach.level is StopLevel.SOFT_STOP else [breach if breach.cause is StopCause.DRIVER else held]
     t = 0
     for _ in range(latch_module.TUNING.own_releases_max if alone else 1):
@@ -333,6 +334,15 @@ def test_every_status_counts_after_a_late_step() -> None:
         inbox.put("robot/status", each)
     assert state.joint_force > 1.0
     assert late.step(70 * MS, inbox)["supervisor/state"].joint_force == state.joint_force
+
+
+def test_a_hold_that_was_released_within_a_late_step_is_over() -> None:
+    """The older status counted, too: what had been released was latched again."""
+    service, inbox = create(load_scenario("healthy")), HandInbox()
+    for t, mode in ((0, RobotStatus.MODE_SAFE_HOLD), (10 * MS, RobotStatus.MODE_ACTIVE)):
+        inbox.put("robot/status", replace(status(t, 0.0), mode=mode))
+    state: Any = service.step(10 * MS, inbox)["supervisor/state"]
+    assert state.level == SupervisorState.LEVEL_OK
 
 
 def test_an_arm_that_stops_while_it_reports_no_positions_is_no_broken_sensor() -> None:
