@@ -39,6 +39,10 @@ class AdmittanceTuning(NamedTuple):
     """Time constant with which the bias of the F/T sensor is learned in free motion."""
     follow_per_s: float = 50.0
     """Gain of the inverse kinematics on the error of pose and of joint positions."""
+    catch_up_share: float = 0.2
+    """Maximum correction of a joint in free motion over its planned speed: the supervisor stops a tool 1.3 times as fast."""
+    catch_up_radps: float = 0.05
+    """Smallest value of that maximum, so that an arm at rest arrives."""
     posture_per_s: float = 2.0
     """Gain of the inverse kinematics on the error of the posture."""
     posture_radps: float = 0.5
@@ -100,8 +104,9 @@ class AdmittanceController:
             self._tare(model.R_WI)
             self._yield = np.zeros(3)
             error = motion.q - dt * motion.qd - self._q
-            braked = np.sqrt(2 * self._acceleration * np.abs(error))
-            rate = motion.qd + np.clip(TUNING.follow_per_s * error, -braked, braked)
+            most = np.maximum(TUNING.catch_up_share * np.abs(motion.qd), TUNING.catch_up_radps)
+            most = np.minimum(most, np.sqrt(2 * self._acceleration * np.abs(error)))
+            rate = motion.qd + np.clip(TUNING.follow_per_s * error, -most, most)
         else:
             rate = self._cartesian(reference, dt)
         rate = rate / max(1.0, float(np.max(np.abs(rate) / (TUNING.speed_share * model.velocity_limit))))

@@ -148,6 +148,17 @@ def test_the_arm_keeps_its_speed_where_calls_are_missed() -> None:
     np.testing.assert_allclose(reached["some"], reached["all"], atol=2e-4)
 
 
+def test_a_late_arm_catches_up_at_little_more_than_the_planned_speed() -> None:
+    """It doubled its speed after 60 ms: the supervisor stopped it."""
+    contact, fastest, rate = Contact(), 0.0, np.full(7, 0.4)
+    for ms in (*range(200), *range(260, 600)):
+        asked = setpoint(contact.model, contact.asked + 1e-3 * ms * rate, mode=ControlMode.JOINT, qd=rate)
+        before, contact.q = contact.q, contact.law.command(contact.q, REST, reference(asked, ms * MS))
+        fastest = max(fastest, 1e3 * float(np.abs(contact.q - before).max()) if ms != 260 else 0.0)
+    assert fastest < 1.3 * rate[0]
+    np.testing.assert_allclose(contact.q, contact.asked + 0.599 * rate, atol=1e-3)
+
+
 def test_after_a_reset_it_starts_where_the_arm_is() -> None:
     contact = Contact()
     contact.follow(ControlMode.CARTESIAN, PUSH, 50)
