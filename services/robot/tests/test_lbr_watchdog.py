@@ -25,8 +25,8 @@ from palpate_models.scenario.load import load_scenario, plant_input, restrict_to
 from palpate_models.scenario.schema import RobotDriver
 from palpate_robot.backends.emulated import Metronome
 from palpate_robot.backends.hardware import TAKE_OVER_NS
-from palpate_robot.backends.lbr.emulator import SESSION, Emulator, FriSession, main
-from palpate_robot.backends.lbr.port import TORQUE_COMMAND, ConnectionQuality, LBRTorqueCommand, SessionState, ZenohPort
+from palpate_robot.backends.lbr.emulator import Emulator, FriSession, main
+from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
 from palpate_robot.backends.lbr.watchdog import lbr_watchdog
 from palpate_robot.backends.watchdog import TIMEOUT_NS, Watchdog
 
@@ -308,18 +308,6 @@ def test_what_breaks_a_rule_ends_the_session_for_good(break_it: object, words: s
     for _ in range(500):
         session.cycle(HOME, ZERO)
     assert session.state is SessionState.IDLE
-
-
-def test_a_client_that_does_not_answer_loses_quality_then_the_session() -> None:
-    session = active()
-    seen = set()
-    for _ in range(SESSION.quality_window):
-        session.cycle(HOME, ZERO, answered=False)
-        seen.add(session.quality)
-        if session.ended:
-            break
-    assert "POOR" in session.ended
-    assert seen == set(ConnectionQuality)
 
 
 def test_the_position_follows_as_the_stacks_controller_makes_it() -> None:

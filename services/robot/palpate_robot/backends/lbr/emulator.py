@@ -15,14 +15,12 @@ and camera it also exchanges exact poses and contact wrenches on topics under `e
 - the command guard ends the session when the commanded position leaves the joint limits or the measured speed exceeds the joint
   limit; it does not check torques (command_guard.cpp: `is_valid_command`);
 - the joint position sent to the arm is the previous one plus `pid_p` times the difference (filters.cpp, `JointPIDArray`);
-- the controller ends the session when overlay plus gravity exceed a torque limit, or when the client does not answer: connection
-  quality falls from EXCELLENT to POOR, at which commanding ends.
+- the controller ends the session when overlay plus gravity exceed a torque limit.
 """
 
 import argparse
 import logging
 import sys
-from collections import deque
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -51,23 +49,18 @@ class SessionTuning(NamedTuple):
     """Time in each monitoring state (assumed); on the arm it lasts until the Sunrise application continues."""
     sync_s: float = 0.1
     """Time in COMMANDING_WAIT (assumed)."""
-    quality_window: int = 100
-    """Answers over which connection quality is computed."""
     pid_p: float = 0.1
     """Gain of the stack's filter of joint positions."""
 
 
 SESSION: Final = SessionTuning()
 
-QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.GOOD), (0.30, ConnectionQuality.FAIR))
-"""Maximum fraction of lost answers per quality (assumed); above the last it is POOR."""
-
 
 class Drive(NamedTuple):
     """Position and overlay applied by the arm's controller in a cycle."""
 
     position: Array
-    """Commanded joint position [rad], shape (7,): set-point of the joint springs if the controller has stiffness."""
+    """Commanded joint position [rad], shape (7,)."""
     torque: Array
     """Overlay [N m], shape (7,)."""
 
@@ -81,11 +74,9 @@ class FriSession:
             raise UserError(f"send period {period_ms} ms: expected whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
         self._dt = period_ms * 1e-3
         self.state = SessionState.IDLE
-        self.quality = ConnectionQuality.POOR
         self.ended = ""
         """Message on the end of the session; empty while it runs."""
         self._in_state = 0.0
-        self._answers: deque[bool] = deque(maxlen=SESSION.quality_window)
         self._target = Drive(q.copy(), np.zeros(7))
         self._position = q.copy()
         self._q_before: Array | None = None
@@ -104,12 +95,9 @@ class FriSession:
         if self.state is SessionState.COMMANDING_ACTIVE:
             self._target = Drive(position, torque)
 
-    def cycle(self, q: Array, gravity: Array, *, answered: bool = True) -> Drive:
+    def cycle(self, q: Array, gravity: Array) -> Drive:
         """Run one send period at measured positions q [rad] and gravity torques [N m]; return the applied drive."""
         self._in_state += self._dt
-        self._answers.append(answered)
-        lost = 1.0 - sum(self._answers) / len(self._answers)
-        self.quality = next((quality for share, quality in QUALITY if lost <= share), ConnectionQuality.POOR)
         if not self.ended:
             self._advance(q)
         if self.state is not SessionState.COMMANDING_ACTIVE:
@@ -120,15 +108,13 @@ class FriSession:
         state, monitored = self.state, self._in_state > SESSION.monitoring_s
         if state is SessionState.IDLE:
             self._enter(SessionState.MONITORING_WAIT)
-        elif state is SessionState.MONITORING_WAIT and monitored and self.quality >= ConnectionQuality.GOOD:
+        elif state is SessionState.MONITORING_WAIT and monitored:
             self._enter(SessionState.MONITORING_READY)
         elif state is SessionState.MONITORING_READY and monitored:
             self._enter(SessionState.COMMANDING_WAIT)
         elif state is SessionState.COMMANDING_WAIT and self._in_state > SESSION.sync_s:
             self._enter(SessionState.COMMANDING_ACTIVE)
             self._target, self._position = Drive(q.copy(), np.zeros(7)), q.copy()
-        elif state >= SessionState.COMMANDING_WAIT and self.quality is ConnectionQuality.POOR:
-            self.end("connection quality is POOR: the client does not answer in time")
 
     def _apply(self, q: Array, gravity: Array) -> Drive:
         if not (np.isfinite(self._target.position).all() and np.isfinite(self._target.torque).all()):
@@ -156,10 +142,10 @@ log = logging.getLogger("emulator")
 class Emulator(EmulatedArm):
     """Physics and session; call `cycle` once per send period. Time comes from the caller."""
 
-    def __init__(self, known: PlantInput, period_ms: int = 2, stiffness_nm: float = 0.0, gravity_error_nm: float = 0.0) -> None:
+    def __init__(self, known: PlantInput, period_ms: int = 2, gravity_error_nm: float = 0.0) -> None:
         """Create the arm of a scenario, with its errors; arguments as the options of `main`."""
         super().__init__(known, period_ms)
-        self.session, self._stiffness = FriSession(period_ms, self.measured), stiffness_nm
+        self.session = FriSession(period_ms, self.measured)
         self._load_error = self._load_rng.uniform(-1.0, 1.0, 7) * gravity_error_nm
         """Constant error of the arm's load data [N m]."""
         self._applied = Drive(self.measured, np.zeros(7))
@@ -167,17 +153,12 @@ class Emulator(EmulatedArm):
     def cycle(self) -> None:
         """Advance the arm by one send period under the newest command."""
         self.measure()
-        plant, stiffness = self._plant, self._stiffness
+        plant = self._plant
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque())
         active = self.session.state is SessionState.COMMANDING_ACTIVE
-        damping = 2 * 0.7 * np.sqrt(np.full(7, stiffness)) if active else np.full(7, BRAKE_NMS)
-        error = self._load_error if active else np.zeros(7)
-
-        def torques() -> tuple[Array, Array]:
-            spring = stiffness * (drive.position - self._joints.q)
-            return plant.gravity_torque() + drive.torque + spring + error, damping
-
-        self.advance(torques)
+        damping = np.full(7, 0.0 if active else BRAKE_NMS)
+        torque = drive.torque + (self._load_error if active else np.zeros(7))
+        self.advance(lambda: (plant.gravity_torque() + torque, damping))
 
     def state(self, now: int) -> Any:
         """Return LBRState at wall time `now` [ns]."""
@@ -186,7 +167,7 @@ class Emulator(EmulatedArm):
         return port.LBRState(
             sample_time=self.period_ms * 1e-3,
             session_state=int(session.state),
-            connection_quality=int(session.quality),
+            connection_quality=int(ConnectionQuality.EXCELLENT),
             safety_state=int(port.SafetyState.NORMAL_OPERATION),
             operation_mode=2,
             drive_state=1,
@@ -235,13 +216,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint that replaces rmw_zenohd")
     parser.add_argument("--domain", type=int, default=0, help="ROS domain")
     parser.add_argument("--period-ms", type=int, default=2, help="FRI send period")
-    parser.add_argument("--stiffness", type=float, default=0.0, help="stiffness of the joint impedance controller [N m/rad]")
     parser.add_argument("--gravity-error", type=float, default=0.0, help="largest error of the load data per joint [N m]")
     given = parser.parse_args(arguments)
     logging.basicConfig(level="INFO", format="%(asctime)s emulator %(levelname)s %(message)s", stream=sys.stderr)
     try:
         known = plant_input(load_scenario(given.scenario))
-        emulator = Emulator(known, given.period_ms, given.stiffness, given.gravity_error)
+        emulator = Emulator(known, given.period_ms, given.gravity_error)
         node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
     except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)
