@@ -177,7 +177,7 @@ class ExaminationSequence:
         return dict.fromkeys(remaining, self.status.cause) | self.skipped
 
     def step(self, now: Observation) -> ExamStep:
-        """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
+        """Advance one planning period. Before the first reading of the robot, the set-point is without stiffness."""
         course, status = self._course, self.status
         course.rate = self._restart.step(now.t)
         self._began = now.t if self._began is None else self._began
@@ -209,14 +209,15 @@ class ExaminationSequence:
     # --- waits --------------------------------------------------------------------------------------------------------
 
     def _await_robot(self, now: Observation, began: int) -> None:
-        """Report that the robot is awaited since `began` [ns], with its reason if it has one, and abort after a time."""
+        """Report that the robot is awaited since `began` [ns], with its reason if any; abort after a time or on request."""
         status, waited_s, reason = self.status, (now.t - began) / SECOND, now.stop.cause.text
-        if status.phase in OVER or waited_s < WAIT.reported_s:
+        if status.phase in OVER:
             return
-        status.cause, status.message = FOR_ROBOT.cause, reason or FOR_ROBOT.cause.text
-        if waited_s > WAIT.limit_s:
-            text = f"aborted before the robot was ready: {reason or FOR_ROBOT.end.text}"
-            self._course.enter(Phase.ABORTED, now.t, text, FOR_ROBOT.end)
+        if now.end or waited_s > WAIT.limit_s:
+            text = f"aborted before the robot was ready: {now.end.text or reason or FOR_ROBOT.end.text}"
+            self._course.enter(Phase.ABORTED, now.t, text, now.end or FOR_ROBOT.end)
+        elif waited_s >= WAIT.reported_s:
+            status.cause, status.message = FOR_ROBOT.cause, reason or FOR_ROBOT.cause.text
 
     def _await_plan(self, t: int) -> None:
         """Report that the motion planner is awaited: in wall-clock mode it may take long."""

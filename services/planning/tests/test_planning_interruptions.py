@@ -484,6 +484,13 @@ def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:
     assert exam.status.end_tick < (7 + WAIT.limit_s + 3) * SECOND
 
 
+def test_an_operator_may_end_before_the_robot_is_ready() -> None:
+    exam = ExaminationSequence(known(BASE, **SMALL), PERIOD_S, FRAME, RATES)
+    exam.step(Observation(0, None, end=Cause(Reason.OPERATOR_END, "enough")))
+    exam.step(Observation(0, None))
+    assert (exam.status.phase, exam.status.cause.reason) == (Phase.ABORTED, Reason.OPERATOR_END)
+
+
 @pytest.mark.parametrize("phase", [Phase.HOME, Phase.SCAN], ids=lambda phase: phase.name)
 def test_a_stop_that_returns_again_and_again_ends_the_examination(phase: Phase) -> None:
     settings, patience_s = known(**SMALL), 10.0
