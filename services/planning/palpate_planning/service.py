@@ -125,6 +125,8 @@ CULPRITS = {
 """Role or topic behind the reason why perception has no targets; any other reason is seen in the images."""
 NOT_RELEASABLE = frozenset({SupervisorState.CAUSE_SENSOR})
 """Causes of a stop that no release ends."""
+STATUS_AGE = contract().topics["robot/status"].max_age
+"""An older measurement [ns] stops the arm: it would press without a known depth and force."""
 BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -137,7 +139,7 @@ class PlanningService(Service):
     def __init__(self, known: ExamInput, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
         """`before` and `lockstep` as in `ExaminationSequence`."""
         roles = contract().roles
-        self._known = known
+        self._known, self._lockstep = known, lockstep
         self._X_WA = np.array(known.X_WA)
         if not lockstep:
             _lower_worker_priority()
@@ -147,6 +149,8 @@ class PlanningService(Service):
         self._max_silence = setpoints.expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
+        self._targets: Message | None = None
+        """Targets that await their surface."""
         self._peak_force = 0.0
         self._commanded = False
         """True once the driver has accepted a command."""
@@ -168,7 +172,7 @@ class PlanningService(Service):
                 motion=self._motion(inbox),
                 averaged=self._mean_height(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
-                stop=_stop(status, state, requests, self._commanded),
+                stop=_stop(status, state, requests, self._unready(t, status)),
                 end=_end(requests),
                 lost=self._disconnection(t, inbox),
                 request=self._request(inbox),
@@ -177,10 +181,10 @@ class PlanningService(Service):
         )
         if step.contact is not None and step.contact.touching:
             self._peak_force = max(self._peak_force, step.contact.load)
-        outbox: dict[str, Message | list[Message]] = {
-            "planning/setpoint": step.setpoint.message(),
-            "exam/state": state_message(t, self._exam.status, step.contact),
-        }
+        outbox: dict[str, Message | list[Message]] = {}
+        if self._lockstep or step.contact is not None:  # before the first reading, an arm of positions would move to a set-point
+            outbox["planning/setpoint"] = step.setpoint.message()
+        outbox["exam/state"] = state_message(t, self._exam.status, step.contact)
         if step.trigger:
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
         if step.touched is not None:
@@ -204,20 +208,27 @@ class PlanningService(Service):
         }
 
     def _new_surface(self, inbox: Inbox) -> PerceivedAbdomen | Cause | None:
-        """Return perception's newest answer, if one arrived."""
-        for mesh in inbox.new("perception/surface"):
-            self._mesh = mesh
-        answers = [self._answer(targets) for targets in inbox.new("perception/targets")]
-        return answers[-1] if answers else None
+        """Return perception's newest answer, once its targets and the surface of the same time have arrived."""
+        for message in inbox.new("perception/surface"):
+            self._mesh = message
+        for message in inbox.new("perception/targets"):
+            self._targets = message
+        targets, mesh = self._targets, self._mesh
+        if targets is None:
+            return None
+        if len(targets.positions) and (mesh is None or mesh.header.stamp != targets.header.stamp):
+            return None
+        self._targets = None
+        return self._answer(targets, mesh)
 
-    def _answer(self, targets: Message) -> PerceivedAbdomen | Cause:
-        if not len(targets.positions) or self._mesh is None:
-            text = targets.message or "perception found no targets, or no usable surface"
+    def _answer(self, targets: Message, mesh: Message | None) -> PerceivedAbdomen | Cause:
+        if not len(targets.positions):
+            text = targets.message or "perception found no targets"
             blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
             reason = Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED
             return Cause(reason, text, CULPRITS.get(targets.reason, "camera/depth/image_raw"))
         try:
-            return abdomen_of(self._mesh, targets, self._X_WA)
+            return abdomen_of(mesh, targets, self._X_WA)
         except ValueError as error:
             return Cause(Reason.VIEW_FAILED, str(error), "perception")
 
@@ -246,6 +257,16 @@ class PlanningService(Service):
         depth = min(float(message.depth), self._known.limits.depth_m)  # a policy may request more
         return PressRequest(int(message.number), xy, depth, message.reason)
 
+    def _unready(self, t: int, status: Message | None) -> Cause:
+        """Return why the robot cannot be used, if it cannot: a driver that is idle again, after a release, awaits a command."""
+        if status is None:
+            return NO_CAUSE
+        if status.mode == RobotStatus.MODE_IDLE and (self._commanded or status.cause != RobotStatus.CAUSE_NONE):
+            return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason or 'no command yet'}", "robot")
+        age = 0 if self._reading is None else t - self._reading.stamp
+        text = f"robot/status: measured {age / MS:.0f} ms ago, limit {STATUS_AGE / MS:.0f} ms"
+        return Cause(Reason.ROBOT_NOT_READY, text, "robot/status") if age > STATUS_AGE else NO_CAUSE
+
     def _disconnection(self, t: int, inbox: Inbox) -> Cause:
         """Return the cause if needed roles are disconnected, or the supervisor is silent for longer than a set-point is valid."""
         searching = ("search",) if self._known.exam.searched else ()
@@ -258,11 +279,10 @@ class PlanningService(Service):
         return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 
 
-def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...], commanded: bool) -> ArmStop:
+def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...], unready: Cause) -> ArmStop:
     """Return the stop, if any.
 
-    `status` is the latest `robot/status`, `state` the latest `supervisor/state`. `commanded`: the driver has accepted a command;
-    one that is idle again, after a release, awaits the next.
+    `status` is the latest `robot/status`, `state` the latest `supervisor/state`; `unready`: why the robot cannot be used.
     """
     wrong = None if state is None or state.level == SupervisorState.LEVEL_OK else state
     final = wrong is not None and wrong.cause in NOT_RELEASABLE
@@ -272,9 +292,8 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         source = wrong if wrong is not None and final else status
         return ArmStop(Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {source.reason}", source.culprit), final=final)
-    if status is not None and status.mode == RobotStatus.MODE_IDLE and (commanded or status.cause != RobotStatus.CAUSE_NONE):
-        text = f"the robot is not ready: {status.reason or 'no command yet'}"
-        return ArmStop(Cause(Reason.ROBOT_NOT_READY, text, "robot"), final=final)
+    if unready:
+        return ArmStop(unready, final=final)
     if wrong is None:
         return NO_STOP
     if wrong.level == SupervisorState.LEVEL_SOFT_STOP:

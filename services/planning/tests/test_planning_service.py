@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, SMALL, World, known
+from planning_fakes import BASE, SMALL, World, hertz, known
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
@@ -30,6 +30,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Scenario
 from palpate_planning.service import PlanningService, create
 from palpate_planning.status import ExamStep
+from palpate_planning.strokes.plan import PerceivedAbdomen
 
 HOME = np.array(lbr.HOME)
 OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
@@ -64,8 +65,17 @@ class BusWorld(World):
         self.inbox = HandInbox()
         self.damage: Callable[[Any, Any], None] = lambda surface, targets: None
         """Change of a perceived surface and of the targets on the bus."""
+        self.silent = False
+        """True while `robot/status` does not arrive."""
         self.states: list[Any] = []
         self.events: list[str] = []
+
+    def view(self, t: int) -> tuple[Any, Any]:
+        """Return the surface and the targets as perception sends them at `t` [ns]."""
+        surface = mesh_message(header(t, "world"), self.dome.vertices, triangles=self.dome.triangles)
+        points, lines = [point_message(p) for p in self.dome.positions], np.asarray(self.dome.lines, dtype=np.uint32)
+        normals = [Vector3(0.0, 0.0, 1.0)] * len(points)
+        return surface, PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, 0, "")
 
     def step(self) -> ExamStep:
         inbox, t = self.inbox, self.t
@@ -73,13 +83,11 @@ class BusWorld(World):
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
         w = np.concatenate((contact + self.weight.weight_S(R_WS) + self.bias, np.zeros(3)))
-        inbox.put("robot/status", status(t, self.q, w))
+        if not self.silent:
+            inbox.put("robot/status", status(t, self.q, w))
         if self._answer_at is not None and t >= self._answer_at:
             self._answer_at = None
-            surface = mesh_message(header(t, "world"), self.dome.vertices, triangles=self.dome.triangles)
-            points, lines = [point_message(p) for p in self.dome.positions], np.asarray(self.dome.lines, dtype=np.uint32)
-            normals = [Vector3(0.0, 0.0, 1.0)] * len(points)
-            targets = PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, 0, "")
+            surface, targets = self.view(t)
             self.damage(surface, targets)
             inbox.put("perception/surface", surface).put("perception/targets", targets)
         if self.status.phase is Phase.ASSESS:
@@ -130,12 +138,12 @@ def test_the_arm_is_held_where_it_was_found() -> None:
 
 
 def test_a_status_without_positions_is_no_measurement() -> None:
-    service, inbox, none = create(Scenario(robot=BASE)), HandInbox(), np.zeros(0)
+    service, inbox, none = PlanningService(known(**SMALL), lockstep=False), HandInbox(), np.zeros(0)
     missing = status(0, none, np.zeros(6), RobotStatus.MODE_IDLE, "no joint states received yet")
     inbox.put("robot/status", replace(missing, velocity=none))
     for t in (0, 6000 * MS):
-        out = sent(service.step(t, inbox))
-    assert not np.any(out["planning/setpoint"].joint_stiffness)
+        out = service.step(t, inbox)
+    assert "planning/setpoint" not in out
     assert (out["exam/state"].reason, out["exam/state"].phase) == (Reason.WAITS_FOR_ROBOT, Phase.HOME)
     assert out["exam/state"].message == "the robot is not ready: no joint states received yet"
     inbox.put("robot/status", status(6010 * MS, HOME + 0.2, np.zeros(6)))
@@ -179,6 +187,29 @@ def test_holds_and_stops_wait(topic: str, message: Any, reason: Reason) -> None:
 def test_a_lost_robot_aborts() -> None:
     state = after("robot", None)
     assert (state.reason, state.phase, state.end_tick) == (Reason.SERVICE_LOST, Phase.ABORTED, 1020 * MS)
+
+
+def test_nothing_is_pressed_without_measurements() -> None:
+    world = BusWorld()
+    world.force = hertz(25.0)
+    world.run(lambda: world.pressed > 5.0)
+    pressed, world.silent = [world.pressed], True
+    for _ in range(25):
+        world.step()
+        pressed.append(world.pressed)
+    assert (*world.end, world.status.cause.culprit) == (Phase.HELD, Reason.ROBOT_NOT_READY, "robot/status")
+    assert pressed[-1] < max(pressed) < pressed[0] + 4.0
+    world.silent = False
+    world.step()
+    assert world.end == (Phase.RETRACT, Reason.NONE)
+
+
+def test_targets_are_used_with_their_own_surface_alone() -> None:
+    world, inbox = BusWorld(), HandInbox()
+    for t in (0, 10 * MS):
+        surface, targets = world.view(t)
+        assert world.service._new_surface(inbox.receive({"perception/targets": targets})) is None
+        assert isinstance(world.service._new_surface(inbox.receive({"perception/surface": surface})), PerceivedAbdomen)
 
 
 @pytest.mark.parametrize("coincident", [False, True])
