@@ -39,7 +39,7 @@ from palpate_tissue.backends.winkler.service import create as create_tissue
 
 Observe = Callable[[int, Mapping[str, Any]], None]
 """Called with the time [ns] and the outbox of each step."""
-Engine = Callable[[Robot, Array, DrawnArm], Plant]
+Engine = Callable[[Robot, DrawnArm, Array], Plant]
 """A plant at rest at some joint positions."""
 Script = Callable[[int], Mapping[str, Message]]
 """Messages that a topic without a producer is to bring at a time [ns]."""
@@ -302,7 +302,7 @@ def press(contrast: float, stiffness: float, delays: Delays, arm: str = DEFAULT_
             modes.append(outbox["robot/status"].mode)
 
     script = _Script(contrast, stiffness, arm)
-    robot = RobotService(plant_input(chosen), lambda robot, *, drawn: engine(robot, script.ready, drawn))
+    robot = RobotService(plant_input(chosen), lambda robot, *, drawn: engine(robot, drawn, script.ready))
     run = Composed(
         [
             Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_robot),

@@ -2,11 +2,8 @@
 
 from typing import Final, Protocol
 
-import numpy as np
-
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.errors import ArmErrors, DrawnArm, draw_arm
+from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 
 DT: Final = 1e-3
@@ -15,11 +12,6 @@ END_STOP_MARGIN_RAD: Final = 0.03
 """Distance of the mechanical end stop behind the position limit (assumed); the driver acts at the limit."""
 STICK_RADPS: Final = 1e-3
 """Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this (assumed)."""
-
-
-def nominal_arm(robot: Robot) -> DrawnArm:
-    """Return an arm without errors."""
-    return draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)), arm_of(robot).joints)
 
 
 Wrench = tuple[float, float, float, float, float, float]

@@ -123,7 +123,7 @@ def test_measured_velocity_is_the_derivative_of_measured_position() -> None:
 def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None:
     """To first order each joint's origin moves the tool as it is turned by the joints before it."""
     drawn = arm(length_m=0.001)
-    true, nominal = plant(Robot(), drawn=drawn), plant(Robot())
+    true, nominal = plant(Robot(), drawn=drawn), plant(Robot(), arm())
     moved = true.tool_motion()[:3] - nominal.tool_motion()[:3]
     turns = Rotation.from_quat(nominal.link_poses()[:7, 3:]).as_matrix()
     expected = sum(turn @ error for turn, error in zip(turns, drawn.origin_m, strict=True))
@@ -135,7 +135,7 @@ def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None
 def test_the_sensor_feels_the_true_tool_and_the_controller_carries_the_nominal_one(plant: Any) -> None:
     drawn, weights, carried = arm(tool_mass=0.3, seed=3), [], []
     assert abs(drawn.tool_mass - 1) > 0.05
-    for one in (plant(Robot(), drawn=drawn), plant(Robot())):
+    for one in (plant(Robot(), drawn), plant(Robot(), arm())):
         for _ in range(3):
             one.step(one.gravity_torque(), NOTHING, NOTHING, np.full(7, 1e6))
         weights.append(one.sensor_wrench()[2] / (Robot().tool_mass_kg * GRAVITY))
@@ -169,8 +169,8 @@ def test_the_service_measures_another_tool_pose_than_the_true_one_and_reports_th
         found.append(np.linalg.norm(reported - vector(sent["sim/tool_state"].pose.position)))
     assert found[0] < 1e-5
     drawn = draw_errors(Errors(level="poor"), 5).arm
-    lengths = DartPlant(Robot(), drawn=drawn).tool_motion()[:3] - DartPlant(Robot()).tool_motion()[:3]
-    sag = 1e-4 * DartPlant(Robot()).gravity_torque()
+    lengths = DartPlant(Robot(), drawn=drawn).tool_motion()[:3] - DartPlant(Robot(), arm()).tool_motion()[:3]
+    sag = 1e-4 * DartPlant(Robot(), arm()).gravity_torque()
     turned = tool_jacobian(np.array(lbr.HOME), Robot())[:3] @ (drawn.zero_rad + sag)
     assert found[1] == pytest.approx(np.linalg.norm(lengths - turned), abs=0.4e-3)
     assert found[1] > 1e-3

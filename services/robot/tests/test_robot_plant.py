@@ -23,6 +23,7 @@ from palpate_robot.position_loop import TUNING, PositionLoop
 
 LINKS = link_names(Robot())
 NOTHING, NO_DAMPING = np.zeros(3), np.zeros(7)
+NOMINAL = draw_errors(Errors(level="none"), 0).arm
 FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
 
 OVER_TABLE = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0])
@@ -36,7 +37,7 @@ def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
 
 def test_motion_poses_and_weight_agree_with_pinocchio_and_the_engine() -> None:
     robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
-    plant = DartPlant(robot)
+    plant = DartPlant(robot, NOMINAL)
     model, data = _model(robot)
     rng = np.random.default_rng(2)
     frame = model.getFrameId("indenter")
@@ -59,7 +60,7 @@ def test_motion_poses_and_weight_agree_with_pinocchio_and_the_engine() -> None:
 
 
 def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
-    plant = DartPlant(FREE)
+    plant = DartPlant(FREE, NOMINAL)
     model, data = _model(FREE)
     rng = np.random.default_rng(3)
     frame = model.getFrameId("indenter")
@@ -77,7 +78,7 @@ def test_accelerations_agree_with_pinocchio_under_a_tool_wrench() -> None:
 def test_friction_is_implicit() -> None:
     """(M + dt D) a = tau - h - D v is stable whatever D; explicit, 10 N m s/rad on a wrist of 5e-4 kg m^2 is not."""
     robot = Robot(joint_friction_nm=0.2)
-    plant = DartPlant(robot)
+    plant = DartPlant(robot, NOMINAL)
     model, data = _model(robot)
     rng = np.random.default_rng(4)
     for extra in (0.0, 40.0):
@@ -96,7 +97,7 @@ def test_friction_is_implicit() -> None:
 @pytest.mark.parametrize("joint", range(7))
 def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joint: int) -> None:
     robot = Robot(joint_friction_nm=0.5)
-    plant = DartPlant(robot, np.zeros(7))
+    plant = DartPlant(robot, NOMINAL)
     push = np.zeros(7)
     for torque, speed in ((0.25, None), (1.5, (1.5 - 0.5) / robot.joint_damping_nms)):
         push[joint] = torque
@@ -112,7 +113,7 @@ def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joi
 @pytest.mark.parametrize(("make", "bounce_rad"), [(DartPlant, 2e-3), (MujocoPlant, 8e-3)])
 def test_end_stop_stops_the_joint(make: type[Plant], bounce_rad: float) -> None:
     """75 % of A7's torque limit pushes on; MuJoCo's stop is soft."""
-    plant = make(Robot())
+    plant = make(Robot(), NOMINAL)
     push = np.zeros(7)
     push[6] = 30.0
     for _ in range(1500):
@@ -128,7 +129,7 @@ def contacts(plant: Plant) -> int:
 
 @pytest.mark.parametrize("make", [DartPlant, MujocoPlant])
 def test_arm_comes_to_rest_on_the_table_not_in_it(make: type[Plant]) -> None:
-    plant = make(Robot(), OVER_TABLE)
+    plant = make(Robot(), NOMINAL, OVER_TABLE)
     touched = 0
     for _ in range(2500):
         plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)  # limp: nothing carries the arm
@@ -140,7 +141,7 @@ def test_arm_comes_to_rest_on_the_table_not_in_it(make: type[Plant]) -> None:
 def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
     """Straight down at 30 mm/s, the scan's speed, when the hold begins; no tissue helps to stop it."""
     q = np.deg2rad([0.0, 30.0, 0.0, -80.0, 0.0, 70.0, 0.0])
-    plant = DartPlant(Robot())
+    plant = DartPlant(Robot(), NOMINAL)
     plant.reset(q, np.linalg.pinv(tool_jacobian(q, Robot())) @ [0.0, 0.0, -0.03, 0.0, 0.0, 0.0])
     start = plant.tool_motion()
     for _ in range(300):
@@ -161,14 +162,14 @@ def _settle(plant: Plant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTH
 
 @pytest.mark.parametrize("make", [DartPlant, MujocoPlant])
 def test_reading_is_right_before_the_first_step(make: type[Plant]) -> None:
-    wrench = make(ROBOT).sensor_wrench()
+    wrench = make(ROBOT, NOMINAL).sensor_wrench()
     np.testing.assert_allclose(wrench, [0.0, 0.0, ROBOT.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize(("make", "error_n"), [(DartPlant, 0.01), (MujocoPlant, 0.1)])
 def test_press_from_below_pushes_along_minus_z_of_the_sensor(make: type[Plant], error_n: float) -> None:
     """HOME holds the tool straight down; tissue presses the sphere upwards, so into the flange: -z of the sensor."""
-    plant = make(ROBOT)
+    plant = make(ROBOT, NOMINAL)
     free = _settle(plant)
     pressed = _settle(plant, force=np.array([0.0, 0.0, 5.0]))
     np.testing.assert_allclose((pressed - free)[:3], [0.0, 0.0, -5.0], atol=error_n)
@@ -176,7 +177,7 @@ def test_press_from_below_pushes_along_minus_z_of_the_sensor(make: type[Plant], 
 
 def test_moving_tool_reads_weight_contact_and_inertia() -> None:
     """Newton and Euler for the body below the sensor, from pinocchio, along a motion of the plant."""
-    plant = DartPlant(ROBOT, lbr.HOME)
+    plant = DartPlant(ROBOT, NOMINAL)
     model, data = _model(ROBOT)
     frame = model.getFrameId("ft_sensor")
     X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, TOOL.ft_to_indenter_m]))
@@ -207,7 +208,7 @@ class Thorough(DartPlant):
 @pytest.mark.parametrize(("start", "carried", "touches"), [(lbr.HOME, 1.0, False), (OVER_TABLE, 0.0, True)])
 def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -> None:
     """An arm that swings in the air, and a limp one that falls onto the table."""
-    quick, thorough = DartPlant(Robot(), start), Thorough(Robot(), start)
+    quick, thorough = DartPlant(Robot(), NOMINAL, start), Thorough(Robot(), NOMINAL, start)
     rng = np.random.default_rng(2)
     free = touched = 0
     for k in range(2500):
@@ -230,8 +231,8 @@ def postures(count: int, seed: int = 1) -> np.ndarray:
     return lbr.HOME + np.random.default_rng(seed).uniform(-0.3, 0.3, (count, 7))
 
 
-@pytest.mark.parametrize("drawn", [None, draw_errors(Errors(level="poor"), 7).arm], ids=["nominal", "poor"])
-def test_poses_twist_and_gravity_are_the_same(drawn: DrawnArm | None) -> None:
+@pytest.mark.parametrize("drawn", [NOMINAL, draw_errors(Errors(level="poor"), 7).arm], ids=["nominal", "poor"])
+def test_poses_twist_and_gravity_are_the_same(drawn: DrawnArm) -> None:
     robot, rng = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3), np.random.default_rng(2)
     mujoco, dart = (plant(robot, drawn=drawn) for plant in (MujocoPlant, DartPlant))
     for q in postures(10):
@@ -251,7 +252,7 @@ def test_poses_twist_and_gravity_are_the_same(drawn: DrawnArm | None) -> None:
 
 def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[MujocoPlant, DartPlant]]:
     """Both arms under the same torques and the same force at the tool, as strong as in an examination."""
-    mujoco, dart = MujocoPlant(robot), DartPlant(robot)
+    mujoco, dart = MujocoPlant(robot, NOMINAL), DartPlant(robot, NOMINAL)
     mujoco.reset(q)
     dart.reset(q)
     strength = np.array([20.0, 20.0, 15.0, 15.0, 6.0, 4.0, 2.0])
@@ -289,7 +290,7 @@ class Arm:
     """A plant that follows positions."""
 
     def __init__(self, plant: type) -> None:
-        self.plant = plant(Robot())
+        self.plant = plant(Robot(), NOMINAL)
         self.loop = PositionLoop(ARM, self.plant.q)
 
     def step(self, command: np.ndarray | None, force_W: np.ndarray | None = None, age: int = 0) -> np.ndarray:

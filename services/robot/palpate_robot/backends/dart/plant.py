@@ -29,7 +29,7 @@ from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.kinematics import Kinematics
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench, nominal_arm
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench
 
 
 class ClearanceTuning(NamedTuple):
@@ -120,9 +120,9 @@ def _environment(robot: Robot) -> Any:
 class DartPlant(Plant):
     """The arm with its tool."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
+    def __init__(self, robot: Robot, drawn: DrawnArm, q: Sequence[float] | Array | None = None) -> None:
         """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
-        arm, drawn = arm_of(robot), drawn or nominal_arm(robot)
+        arm = arm_of(robot)
         joints = slice(1, 1 + arm.joints)
         self._arm = _load_arm(robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass}))
         for joint, origin, error in zip(self._arm.getJoints()[joints], arm.origin_m, drawn.origin_m, strict=True):

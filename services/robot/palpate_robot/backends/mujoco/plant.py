@@ -25,7 +25,7 @@ from palpate_models.robot.chain import Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench, nominal_arm
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench
 
 SUBSTEPS: Final = 2
 """Integration steps per millisecond: different from the DART plant, so that effects of the step size show."""
@@ -63,12 +63,12 @@ def _add_shape(body: Any, capsule: Capsule) -> None:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[capsule.radius, 0, 0], **shape)
 
 
-def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
+def build(robot: Robot, drawn: DrawnArm) -> Any:
     """Return the compiled model of the nominal `robot` with the arm errors `drawn`.
 
     Bodies have the names of the links; force and torque sensors are at the measuring face.
     """
-    arm, drawn, X_WB = arm_of(robot), drawn or nominal_arm(robot), base_pose(robot)
+    arm, X_WB = arm_of(robot), base_pose(robot)
     fixed: dict[str, Any] = {
         arm.link_names[-1]: arm.flange_m,
         "ft_sensor": (0.0, 0.0, TOOL.flange_to_ft_m),
@@ -123,9 +123,9 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
 class MujocoPlant(Plant):
     """The arm with its tool."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
+    def __init__(self, robot: Robot, drawn: DrawnArm, q: Sequence[float] | Array | None = None) -> None:
         """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
-        arm, drawn = arm_of(robot), drawn or nominal_arm(robot)
+        arm = arm_of(robot)
         self._model = build(robot, drawn)
         self._data = mujoco.MjData(self._model)
         data = self._data
