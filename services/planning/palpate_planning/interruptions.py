@@ -149,9 +149,9 @@ class Displacement:
         V_WD[:3] += self._direction * self._length.velocity
         return setpoint._replace(p_WD=setpoint.p_WD + self._direction * self._length.position, V_WD=V_WD)
 
-    def shrink(self) -> bool:
-        """Return to the path for one period; True once there."""
-        return self._length.step(0.0, MOTION.transfer_mps)
+    def shrink(self, speed: float) -> bool:
+        """Return to the path for one period with at most `speed` [m/s]; True once there."""
+        return self._length.step(0.0, speed)
 
     def stay(self) -> None:
         """Stop the return."""
@@ -252,5 +252,5 @@ class Recovery:
             return
         if self.failed or self.paused or contact.depth > -RECOVERY.clear_height_m:
             self.displacement.stay()
-        elif self.displacement.shrink():
+        elif self.displacement.shrink(min(MOTION.transfer_mps, self._limits.speed_mps)):
             self.displacement = None

@@ -272,7 +272,7 @@ class Palpation:
         """Wait above the wall; return True if a further segment follows."""
         while True:
             now = yield StrokeStage.WAIT
-            self._motion.depth_axis.step(-SEGMENTS.hover_m, stroke.STROKE.lift_mps)
+            self._motion.move_depth(-SEGMENTS.hover_m, stroke.STROKE.lift_mps)
             if self.recovery.ending:
                 return False
             if not now.paused and (len(self._segments) > self._number + 1 or not self.more):

@@ -202,7 +202,7 @@ def lift(motion: StrokeMotion, height: Callable[[int], float]) -> Stages[None]:
         now = yield StrokeStage.LIFT
         resting = motion.brake()
         highest = max(highest, height(now.t))
-        up = motion.depth_axis.step(-highest, STROKE.lift_mps)
+        up = motion.move_depth(-highest, STROKE.lift_mps)
         if up and resting and not now.paused and (now.ending or (now.calm and now.aligned)):
             return
 
@@ -215,7 +215,7 @@ def travel(motion: StrokeMotion, goal: float) -> Stages[None]:
         if now.paused:
             motion.brake()
         elif not now.aligned:
-            motion.depth_axis.step(min(-STROKE.hop_height_m, motion.depth_axis.position), STROKE.lift_mps)
+            motion.move_depth(min(-STROKE.hop_height_m, motion.depth_axis.position), STROKE.lift_mps)
         else:
             arrived = motion.travel(goal)
 
@@ -267,7 +267,7 @@ class Descent:
 
     def rest(self, height: float) -> bool:
         """Rest `height` [m] above the wall; return True once the sensor is tared."""
-        rested_s = self._rested.update(self._motion.depth_axis.step(-height, STROKE.lift_mps))
+        rested_s = self._rested.update(self._motion.move_depth(-height, STROKE.lift_mps))
         over = rested_s >= TOUCH.rest_s + TOUCH.tare_s
         self.taring = not over and rested_s >= TOUCH.rest_s
         self.stroke += over
@@ -283,7 +283,8 @@ class Descent:
         braking = depth.velocity**2 / MOTION.depth_acceleration_mps2  # twice the stopping distance, since jerk is limited
         near = depth.position > -unsure - TOUCH.margin_m - braking
         self._deepest = max(self._deepest, unsure + self._depth)  # monotonic, as the height of a rest
-        there = depth.step(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps) or depth.position >= TOUCH.blind_m
+        arrived = self._motion.move_depth(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps)
+        there = arrived or depth.position >= TOUCH.blind_m
         if near:
             self._onset.add(contact.depth, contact.force, now.t, contact.wall.displacement)
         if contact.force >= FELT_N and not near:

@@ -103,7 +103,7 @@ class StrokeMotion:
         """Begin a segment, at rest."""
         self.segment = segment
         self.joined = self.joined and segment.free is None
-        speed = self.speed_mps if segment.contact else MOTION.transfer_mps
+        speed = self.speed_mps if segment.contact else min(MOTION.transfer_mps, self._limits.speed_mps)
         wanted = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
         velocity, acceleration = self._limits.joint_velocity_scale * self._arm.velocity_radps, self._arm.acceleration_radps2
         if self._robot.level is not CommandLevel.POSITION:
@@ -190,6 +190,10 @@ class StrokeMotion:
     def stopped_by_force(self) -> bool:
         """True if the force leaves the descent almost no speed."""
         return self._slowdown(0.7, 1.0, 0.0) < MOTION.stopped_speed_fraction
+
+    def move_depth(self, depth: float, speed: float) -> bool:
+        """Move to `depth` [m] with at most `speed` [m/s] and the speed limit of free motion; return True once there."""
+        return self.depth_axis.step(depth, min(speed, self._limits.speed_mps))
 
     def deepen(self) -> bool:
         """Sink towards full depth, slower near the force limit; return True if it is reached."""

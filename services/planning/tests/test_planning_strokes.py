@@ -184,11 +184,26 @@ def test_a_transfer_that_is_left_comes_to_rest_before_the_lift_ends() -> None:
     assert motion.along.velocity < 1e-3
 
 
+def test_the_speed_limit_holds_between_strokes() -> None:
+    path, settings = dome_path(21), known()
+    limits = settings.limits.model_copy(update={"speed_mps": 0.012})
+    motion = StrokeMotion(settings.exam, limits, settings.robot, 0.01, plane(np.eye(4)))
+    motion.start(Segment(path, contact=False))
+    lifting, lifted, travelled = lift(motion, lambda t: 0.1), [0.0], [0.0]
+    next(lifting)
+    for k in range(100):
+        lifting.send(StrokeInput(k, Mock(), paused=True))
+        lifted.append(-motion.depth_axis.velocity)
+    while not motion.travel(path.length):
+        travelled.append(motion.along.velocity)
+    assert [max(lifted), max(travelled)] == pytest.approx([0.012, 0.012], rel=1e-3)
+
+
 def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:
     path, gap = dome_path(1), np.array((0.0, 0.004, 0.003))
     setpoint, displacement = stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0), Displacement(gap, 0.01)
     assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD + gap)
-    while not displacement.shrink():
+    while not displacement.shrink(0.1):
         pass
     assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD)
     assert np.array_equal(stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0).p_WD, setpoint.p_WD)
