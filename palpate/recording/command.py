@@ -86,7 +86,7 @@ def scenario_of(recording: PalpationRecording) -> Scenario:
 
     from palpate.recording.assessed import region
     from palpate.recording.recording import ContactKind
-    from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
+    from palpate_models.scenario.schema import Exam, Limits, Mode, Robot, Scenario
     from palpate_models.section import Pose
 
     samples = recording.samples()
@@ -101,4 +101,5 @@ def scenario_of(recording: PalpationRecording) -> Scenario:
         mode=Mode.CONTINUOUS if sliding else Mode.POINT,
     )
     name = re.sub(r"^\.|[/\\\x00-\x1f]", "_", recording.name)[:100] or "recording"
-    return Scenario(name=name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
+    limits = Limits(depth_m=max(exam.depth_m, Limits().depth_m))
+    return Scenario(name=name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m), limits=limits)

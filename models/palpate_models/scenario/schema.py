@@ -309,7 +309,7 @@ class Scenario(Section):
     search: Search = Search()
     robot: Robot = Robot()
     camera: Camera = Camera()
-    limits: Limits = Limits()
+    limits: Annotated[Limits, Field(validate_default=True)] = Limits()
     tissue: TissueChoice = TissueChoice()
     services: Annotated[Services, Field(validate_default=True)] = Services()
 
@@ -327,6 +327,14 @@ class Scenario(Section):
         """Draw a person from the seed, so that every scenario has a complete phantom."""
         seed = info.data.get("seed")
         return phantom if seed is None else draw_person(phantom, seed)
+
+    @field_validator("limits")
+    @classmethod
+    def _deep_enough(cls, limits: Limits, info: ValidationInfo) -> Limits:
+        exam = info.data.get("exam")
+        if exam is not None and exam.depth_m > limits.depth_m:
+            raise ValueError(f"limits.depth_m = {limits.depth_m:g} m: expected at least exam.depth_m, {exam.depth_m:g} m")
+        return limits
 
     @field_validator("services")
     @classmethod

@@ -80,7 +80,7 @@ class DepthRegulator:
     def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
         """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N].
 
-        No deeper than `depth_max` [m] is commanded, unless the target itself is.
+        No deeper than `depth_max` [m] is commanded, unless the target itself is: where the wall is sought below its estimate.
         """
         self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
         self.force_max = DEPTH.force_fraction * force_working
