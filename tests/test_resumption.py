@@ -17,8 +17,11 @@ from scipy.spatial import KDTree
 from palpate.report import recovery
 from palpate.report.evidence import EvidenceError
 from palpate.report.recovery import FOLDER
+from palpate_assessment.sampling import ForceSample
 from palpate_bus.messages.geometry import Array
 from palpate_bus.recordings import open_recording
+from palpate_models.numerics.frames import apply
+from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_recorder.recover import recover
 
 SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
@@ -105,6 +108,18 @@ def test_an_examination_of_a_patient_who_moved_is_not_resumed(tmp_path: Path, mo
     monkeypatch.setattr(recovery, "_runs", lambda folder: [run])
     with pytest.raises(EvidenceError, match="the patient moved"):
         recovery.resumption(tmp_path)
+
+
+def test_targets_that_were_skipped_before_the_last_one_reached_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = load_scenario("clean")
+    p_A = np.array([(0.0125 * k, 0.0, 0.0) for k in range(8)])
+    targets = [Mock(x=x, y=y, z=z) for x, y, z in apply(np.array(exam_input(scenario).X_WA), p_A)]
+    samples = [ForceSample(0.0, p, np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0, 0.0, False) for p in p_A[[0, 1, 2, 5, 6]]]
+    monkeypatch.setattr(recovery, "AssessmentService", lambda *_: Mock(samples=samples))
+    surface, states = Mock(vertices=np.zeros(9)), [Mock(stroke=1)]
+    run = Mock(scenario=scenario, collected=Mock(motions=[], exam_states=states, targets_reached=7, surface=surface))
+    run.recording.last, run.collected.targets.positions = 0, targets
+    assert recovery._extend(run, None).left == pytest.approx(p_A[[3, 4, 6, 7], :2])
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from palpate.replay.golden import rerun, write_recording
 from palpate.report.scoring import Map, Truth
 from palpate.truth.pressed import Felt, Pressed, Touched, TrueBody, TrueSurface
+from palpate_assessment.sampling import TRAVEL
 from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.mcap_records import BROKEN, RecordingError
 from palpate_bus.messages import NS, StiffnessMap, codec, nanoseconds
@@ -54,6 +55,17 @@ def columns_of(rows: Iterable[tuple[Any, ...]], kinds: np.dtype[Any]) -> dict[st
 def points(message: Any, field: str = "vertices") -> Array:
     """Return a flat array of a message as points, shape (n, 3)."""
     return np.asarray(getattr(message, field), dtype=np.float64).reshape(-1, 3)
+
+
+def unsampled_targets(scenario: Scenario, targets: Any, sampled: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the targets of a `palpation_msgs/PalpationTargets` in A [m], shape (n, 2), and a mask of those without a sample near.
+
+    `sampled`: positions of the samples in A [m], shape (m, 3). Near is half a spacing, or the travel that a sample averages.
+    """
+    p_W = np.array([xyz(p) for p in targets.positions]).reshape(-1, 3)
+    p_A: Array = apply(inverse(np.array(exam_input(scenario).X_WA)), p_W)[:, :2]
+    away = np.linalg.norm(p_A[:, None] - sampled.reshape(-1, 3)[:, :2], axis=-1)
+    return p_A, away.min(axis=1, initial=np.inf) > max(scenario.exam.spacing_m / 2, TRAVEL)
 
 
 def body_of(message: Any) -> TrueBody:

@@ -24,7 +24,6 @@ from palpate_bus.contract import CONDUCTOR, contract
 from palpate_bus.implementations import create
 from palpate_bus.mcap_records import RecordingError
 from palpate_bus.messages import NS, ExamState, codec, nanoseconds
-from palpate_bus.messages.geometry import vector
 from palpate_bus.recordings import RecordedMessage
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.settings import Settings, variable
@@ -204,8 +203,10 @@ def _extend(run: evidence.InterruptedRun, earlier: Checkpoint | None) -> Checkpo
         surface, left = (np.empty((0, 3)), np.empty((0, 2))) if earlier is None else (earlier.surface, earlier.left)
     else:
         surface = apply(X_AW, evidence.points(c.surface))
-        targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
+        felt = np.array([sample.position for sample in assessment.samples])
+        targets, unsampled = evidence.unsampled_targets(run.scenario, c.targets, felt)
         wanted = range(len(targets)) if earlier is None else earlier.remaining_targets(targets, run.scenario.exam.spacing_m)
-        left = targets[[i for i in sorted(wanted) if i >= c.targets_reached - 1]]  # the stroke of the last one starts there
+        unsampled[max(c.targets_reached - 1, 0) :] = True  # the stroke of the last one starts there
+        left = targets[[i for i in sorted(wanted) if unsampled[i]]]
     strokes = max((int(state.stroke) for state in c.exam_states), default=0)
     return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)

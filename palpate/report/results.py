@@ -135,7 +135,10 @@ def _unfelt(scenario: Scenario, result: RunResult) -> dict[str, float]:
         return {Loss.FAULT: region * max(felt - len(result.collected.samples), 0) / exam.target_count}
     lost = result.counters.get("planning", {}).get("facts", {}).get("unfelt_targets")
     if lost is None and result.failure and not scenario.exam.searched:  # planning is lost, or the run was recovered
-        lost = {Loss.UNFINISHED: exam.target_count - result.collected.targets_reached}
+        targets, lost = result.collected.targets, {Loss.UNFINISHED: exam.target_count - result.collected.targets_reached}
+        if targets is not None:
+            sampled = np.array([evidence.xyz(sample.position) for sample in result.collected.samples])
+            lost = {Loss.UNFINISHED: int(evidence.unsampled_targets(scenario, targets, sampled)[1].sum())}
     lost = {Loss.NOT_REACHED: exam.targets_skipped} if lost is None else lost
     return {str(reason): region * count / exam.target_count for reason, count in lost.items() if count}
 
