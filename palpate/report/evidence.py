@@ -58,7 +58,7 @@ def points(message: Any, field: str = "vertices") -> Array:
 
 
 def unsampled_targets(scenario: Scenario, targets: Any, sampled: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the targets of a `palpation_msgs/PalpationTargets` in A [m], shape (n, 2), and a mask of those without a sample near.
+    """Return the targets of `perception/targets` in A [m], shape (n, 2), and a mask of those without a sample near.
 
     `sampled`: positions of the samples in A [m], shape (m, 3). Near is half a spacing, or the travel that a sample averages.
     """
