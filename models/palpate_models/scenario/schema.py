@@ -52,6 +52,10 @@ class Following(StrEnum):
     """The indenter does not follow."""
 
 
+MOTION_NOTICED_S = 1.0
+"""A patient who moves is noticed within this time: the assessment discards what was felt in it, and planning repeats it."""
+
+
 class SearchBudget(Section):
     """Budget of a search."""
 

@@ -23,7 +23,7 @@ from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import ExamInput, Following, Scenario
+from palpate_models.scenario.schema import MOTION_NOTICED_S, ExamInput, Following, Scenario
 from palpate_models.section import quadrant
 
 DEEPER_MAX_M: Final = 0.01
@@ -97,8 +97,6 @@ class MapTuning(NamedTuple):
 MAP = MapTuning()
 RESENT_PER_STEP = 50
 """Samples of an earlier examination that are published in one step."""
-NOTICED_S = 1.0
-"""A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
 
@@ -240,7 +238,7 @@ class AssessmentService(Service):
             self._moved_at = t
             self._breath.forget()
             self._sampler.forget()
-            self.samples = [sample for sample in self.samples if sample.time < t - NOTICED_S]
+            self.samples = [sample for sample in self.samples if sample.time < t - MOTION_NOTICED_S]
 
     def _due(self, t: int) -> bool:
         grown = len(self.samples) >= max(MAP.growing_first, self._mapped + 10)

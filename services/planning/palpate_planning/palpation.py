@@ -11,6 +11,7 @@
 | wall against its forecast | lifts | examined from shortly before; skipped after several repeats |
 """
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from palpate_bus.messages.codes import Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import ExamInput
+from palpate_models.scenario.schema import MOTION_NOTICED_S, ExamInput
 from palpate_planning import stroke
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
@@ -33,8 +34,6 @@ from palpate_planning.wall.wall import PublishedTouch, Wall
 class PalpationTuning(NamedTuple):
     """Tuning of repeated and requested strokes."""
 
-    unnoticed_m: float = 0.03
-    """Path length discarded before detected patient motion [m]; detection takes about 1 s."""
     repeat_m: float = 0.010
     """Path length repeated after an interruption [m]; detection takes about 0.2 s."""
 
@@ -103,6 +102,8 @@ class Palpation:
         self._forces = ForceWatch(period_s)
         self.recovery = Recovery(exam, limits, period_s, tally)
         self.waits, self._strokes_before = StrokeWaits(period_s, tally), strokes
+        self._felt: deque[int | None] = deque(maxlen=round(MOTION_NOTICED_S / period_s))
+        """The target that each of the latest steps measured, None for none."""
         self.ahead: frozenset[int] = frozenset()
         """The targets that are left when the strokes end early."""
         self.bend_needed = 0.0
@@ -129,14 +130,15 @@ class Palpation:
 
     @property
     def remaining(self) -> frozenset[int]:
-        """Targets of the present stroke that were not measured, and those of the later ones."""
+        """Targets of the present stroke that were not measured, of the later ones, and those felt while the patient moved."""
         segment, later = self._motion.segment, self._later
+        if self._watch.moved:
+            later = later.union(i for i in self._felt if i is not None)
         if not measures_targets(segment):
             return later
         measured = self._pressed or self.stage is StrokeStage.SLIDE
         reached = self.recovery.measured_length(self._motion.along.position, measured=measured)
-        behind = TUNING.unnoticed_m if self._watch.moved else 0.0
-        return later.union(segment.path.targets[segment.path.visits > reached - behind].tolist())
+        return later.union(segment.path.targets[segment.path.visits > reached].tolist())
 
     @property
     def _later(self) -> frozenset[int]:
@@ -236,7 +238,9 @@ class Palpation:
             )
         )
         only_touched = self._motion.segment.touch
-        if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and only_touched):
+        measuring = self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD)
+        self._felt.append(self._motion.target if measuring else None)
+        if measuring or (descent.touched and only_touched):
             self.waits.reach(self._number, self._motion.along.position, at_depth=not only_touched)
 
     def _regulate(self, contact: ContactMeasurement) -> None:

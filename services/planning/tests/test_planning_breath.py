@@ -169,6 +169,20 @@ def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     world.complete()
 
 
+@pytest.mark.parametrize("mode", ["continuous", "point"])
+def test_what_was_felt_in_the_last_second_before_motion_is_noticed_is_repeated(mode: str) -> None:
+    world = World(known(region_m=(0.025, 0.025), mode=mode), excursion=breathing)
+    world.reach(StrokeStage.TRANSFER, 3)
+    first = world.exam._course.palpation
+    assert first is not None
+    felt = int(first._segments[first._number - 1].path.targets[-1])
+    assert felt not in first.remaining
+    world.moved = True
+    world.run_to(Phase.LOOK)
+    assert felt in first.ahead
+    world.complete()
+
+
 def test_targets_of_a_new_scan_are_known_by_their_places() -> None:
     before = np.array([(0.01 * k, 0.0, 0.0) for k in range(5)])
     assert nearest_targets(before, before[::-1] + 0.02).tolist() == [4, 3, 2, 1, 0]
