@@ -1,6 +1,6 @@
 """`palpate stop`, `release`, `pause`, `resume`, `step`: control of a run from another terminal."""
 
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, sleep
 from typing import Annotated
 
@@ -49,31 +49,35 @@ def step(ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milli
 
 
 def _request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
-    """Send a request to one run, or to all, and print the answers.
+    """Send a request to one run, or to all at the same time, and print the answers.
 
     Raises UserError for an unknown run, typer.Exit if a run does not answer.
     """
     console = SteadyConsole(stderr=True)
-    failed = False
-    for bus in find_buses(chosen=name) if everyone else [find(chosen=name)]:
+
+    def answered(bus: BusTarget) -> bool:
         try:
             with session(bus.operator()) as joined:
                 answer, after_ms = _answer(joined, bus, word, reason, ms)
         except PalpateError as error:
-            failed = True
             say(f"{bus.title}: {error}")
-        else:
-            text = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
-            console.print(text, soft_wrap=True)
-    if failed:
-        raise typer.Exit(ExitStatus.FAILED)
+            return False
+        console.print(f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)", soft_wrap=True)
+        return True
+
+    buses = find_buses(chosen=name) if everyone else [find(chosen=name)]
+    with ThreadPoolExecutor(len(buses)) as pool:  # a run that does not answer must not delay the stop of another
+        if not all([*pool.map(answered, buses)]):
+            raise typer.Exit(ExitStatus.FAILED)
 
 
 def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: int) -> tuple[str, float]:
     """Return the answer to a request; asks again until the run is discovered, since links to its peers come up one by one."""
     end, key = monotonic() + 1.0, bus.read_key()
-    while monotonic() < end:
-        with suppress(NoConductorError):
+    while True:
+        try:
             return ask(joined, bus.domain, word, reason, ms, key)
+        except NoConductorError:
+            if monotonic() > end:
+                raise
         sleep(0.05)
-    return ask(joined, bus.domain, word, reason, ms, key)

@@ -53,14 +53,18 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
     where = request_key(domain)
     payload = json.dumps({"word": word, "reason": reason, "ms": ms, "sent": time_ns()}).encode()
     tag = b"" if key is None else Tagger(key, where).tag(b"", payload)
+    missing: NotAnswered = NoConductorError("the run does not answer: its conductor has left, or has not started it yet")
     for reply in session.get(where, payload=payload, attachment=tag, timeout=2 * CONFIRM_S):
         if reply.ok is None:
+            missing = NotAnswered(
+                "the run does not answer: it is still starting and will obey at its first tick, or its conductor stands still"
+            )
             continue
         answer = json.loads(reply.ok.payload.to_bytes())
         if not answer["done"]:
             raise NotAnswered(answer["words"])
         return answer["words"], float(answer["after_ms"])
-    raise NoConductorError("the run does not answer: its conductor has left, or has not started it yet")
+    raise missing
 
 
 def order(session: zenoh.Session, domain: int, word: str, reason: str, key: bytes | None) -> str:

@@ -6,18 +6,23 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
+from threading import Event
 from time import monotonic, sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
 import pytest
+import typer
 import zenoh
 
 from palpate.exam_state import exam_state
+from palpate.live import operator
 from palpate_bus.contract import contract
 from palpate_bus.messages import MS, NS, ExamState, IndentationTruth, Point, ServiceReport, SupervisorState, header
-from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
+from palpate_bus.runs.announcement import BusTarget
+from palpate_bus.runs.operator import TIME_REQUESTS, WORDS, NoConductorError, NotAnswered, ask, request_key
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
@@ -251,6 +256,38 @@ def test_a_standstill_is_longer_than_the_services_wait_and_stops_the_heartbeat(
 
 
 # -- the operator
+
+
+def test_a_conductor_that_stands_still_is_not_taken_for_one_that_is_not_there(
+    session: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("palpate_bus.runs.operator.CONFIRM_S", 0.2)
+    with pytest.raises(NoConductorError):
+        ask(session, 0, "stop", "test")
+    queries: list[zenoh.Query] = []
+    session.declare_queryable(request_key(0), queries.append)
+    with pytest.raises(NotAnswered, match="still starting"):
+        ask(session, 0, "stop", "test")
+    assert len(queries) == 1
+
+
+def test_a_run_that_does_not_answer_delays_the_stop_of_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    other_asked, asked = Event(), list[int]()
+
+    def answer(joined: object, domain: int, *_: object) -> tuple[str, float]:
+        asked.append(domain)
+        if domain == 1:
+            assert other_asked.wait(5)
+            raise NotAnswered("it stands still")
+        other_asked.set()
+        return "the driver holds", 1.0
+
+    monkeypatch.setattr(operator, "ask", answer)
+    monkeypatch.setattr(operator, "session", lambda options: nullcontext())
+    monkeypatch.setattr(operator, "find_buses", lambda chosen: [BusTarget(BusOptions(), domain) for domain in (1, 2)])
+    with pytest.raises(typer.Exit):
+        operator.stop()
+    assert sorted(asked) == [1, 2]
 
 
 class Query:
