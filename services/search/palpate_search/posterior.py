@@ -246,7 +246,7 @@ class Posterior:
     def remaining(self, spent_s: float) -> Budget:
         """Return the remaining budget."""
         whole = self.task.budget
-        return Budget(whole.presses - len(self.presses), whole.seconds - spent_s)
+        return Budget(max(whole.presses - len(self.presses), 0), whole.seconds - spent_s)
 
     # --- parts --------------------------------------------------------------------------------------------------------
 

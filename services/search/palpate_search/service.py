@@ -50,7 +50,8 @@ class SearchService(Service):
         self._missed = scenario.search.missed
         self._begin: int | None = None
         """Time of the first request [ns]."""
-        self._number = 0
+        self._number = self._earlier = 0
+        """Requests, and presses of the examination that this one resumed."""
         self._asked: Array | None = None
         """Place of the latest request [m], shape (2,)."""
         self._outline: list[Array] = []
@@ -71,7 +72,7 @@ class SearchService(Service):
         if state is None or state.phase not in PALPATING or self._ended or state.target_index != self._number:
             return {}
         if self._begin is None:
-            self._begin = t
+            self._begin, self._earlier = t, len({press.stroke for press in self._felt})
         for press in {press.stroke: press for press in self._felt}.values():  # a gated press has several samples
             self._posterior.add(press)
         if self._asked is not None and not self._felt:
@@ -116,7 +117,7 @@ class SearchService(Service):
         posterior, left = self._posterior, self._posterior.remaining(self._spent_s)
         if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= TUNING.min_presses:
             return f"the probability of a missed lump is {100 * posterior.lump:.1f} %"
-        if self._number > self._posterior.task.budget.presses:
+        if self._number + self._earlier > posterior.task.budget.presses:
             return f"{posterior.task.budget.presses} presses made"
         if left.seconds <= 0:
             return f"{posterior.task.budget.seconds:g} s elapsed"

@@ -1,6 +1,7 @@
 """Policies, the posterior they use, and the service that asks for presses."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -261,6 +262,20 @@ def test_a_press_that_gave_no_sample_is_over_too(policy: str) -> None:
         rig.run(0.3, {"exam/state": play.state})
         play.over = int(rig.last(REQUEST).number)
     assert len({(item.message.place.x, item.message.place.y) for item in rig.log[REQUEST]}) == 4
+
+
+def test_the_presses_of_an_examination_that_is_resumed_count_for_the_budget() -> None:
+    rig, play = playing(search=Search(policy="raster"), budget=SearchBudget(presses=3))
+    earlier = SimpleNamespace(place=Point(0.04, 0.04, 0.0), depth=DEPTH_M)
+    for stroke in (7, 8):
+        rig.send("assessment/samples", replace(press_belly(rig.t, earlier, np.zeros(2)), stroke=stroke))
+        rig.run(0.02, {})
+    kinds = []
+    for _ in range(2):
+        rig.run(0.3, {"exam/state": play.state})
+        play.over = int(rig.last(REQUEST).number)
+        kinds.append(rig.last(REQUEST).request)
+    assert kinds == [SearchRequest.PRESS, SearchRequest.DONE]
 
 
 SQUARE = Task((0.0, 0.0), (0.1, 0.1))
