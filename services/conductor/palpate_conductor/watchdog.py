@@ -31,8 +31,8 @@ class WatchdogTuning(NamedTuple):
     check_period_s: float = 0.25
     exit_s: float = 0.05
     """A process that exits closes its connections this long before it is gone."""
-    interrupted_s: float = 0.5
-    """If all services are silent for longer, the connection to the conductor is interrupted; they report every 0.2 s."""
+    computing_s: float = 0.5
+    """A service that is silent for longer is in a step; one that waits reports every 0.2 s."""
 
 
 TUNING: Final = WatchdogTuning()
@@ -200,7 +200,7 @@ class RunWatchdog:
 
         Follows who-waits-for-whom from the slowest waiting service to one that does not wait, or around a cycle.
         """
-        computing = self.silent(roles, TUNING.interrupted_s)  # what they waited for before their step is past
+        computing = self.silent(roles, TUNING.computing_s)  # what they waited for before their step is past
         awaited = {role: self._producers.get(self.progress[role].waiting_for, "") for role in roles if role not in computing}
         waiting = {role: producer for role, producer in awaited.items() if producer in roles}
         if all(self.progress[role].waiting_for == "grant" for role in roles):
