@@ -5,7 +5,16 @@ from typing import Any, Final
 import numpy as np
 
 from palpate.check.rig import Feed, ReceivedMessage, Rig, robot_status
-from palpate_bus.messages import MS, ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, header, nanoseconds
+from palpate_bus.messages import (
+    MS,
+    ExamState,
+    ImpedanceSetpoint,
+    OperatorRequest,
+    RobotStatus,
+    SupervisorState,
+    header,
+    nanoseconds,
+)
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.chain import Arm
@@ -32,7 +41,7 @@ class PerfectFollower:
 
     def feed(self) -> Feed:
         """Return the inputs of planning."""
-        return {"robot/status": self._status}
+        return {"robot/status": self._status, "supervisor/state": _supervise}
 
     def _status(self, t: int) -> Any:
         setpoint = self._rig.last(SETPOINT)
@@ -42,6 +51,10 @@ class PerfectFollower:
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
         return robot_status(t, self.q, velocity, (0.0, 0.0, WEIGHT_N), np.zeros_like(self.q), self.mode, cause, reason)
+
+
+def _supervise(t: int) -> Any:
+    return SupervisorState(header(t), SupervisorState.LEVEL_OK, SupervisorState.CAUSE_NONE, "", 0, 0.0, -1.0, 0.0, 0, "", 0.0)
 
 
 def suite(rig: Rig) -> None:

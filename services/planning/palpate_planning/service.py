@@ -127,6 +127,8 @@ NOT_RELEASABLE = frozenset({SupervisorState.CAUSE_SENSOR})
 """Causes of a stop that no release ends."""
 STATUS_AGE = contract().topics["robot/status"].max_age
 """An older measurement [ns] stops the arm: it would press without a known depth and force."""
+STARTUP = NS
+"""The supervisor may be this much later than planning [ns] at the start: processes start one by one."""
 BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -147,6 +149,8 @@ class PlanningService(Service):
         setpoints = contract().topics[TOPIC]
         self._exam = ExaminationSequence(known, step_s, frame_ns, setpoints.rates, before, lockstep=lockstep)
         self._max_silence = setpoints.expiry
+        self._began: int | None = None
+        """Time of the first step [ns]."""
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._targets: Message | None = None
@@ -157,6 +161,7 @@ class PlanningService(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Advance one planning period: read the measurements, step the examination, write set-point and state."""
+        self._began = t if self._began is None else self._began
         status = inbox.latest("robot/status")
         if status is not None and len(status.position):
             stamp, force = nanoseconds(status.header.stamp), wrench(status.wrench)
@@ -274,7 +279,9 @@ class PlanningService(Service):
         gone = [role for role in needed if inbox.lost(role)]
         culprit = gone[0] if gone else "supervisor/state"
         last = inbox.stamp("supervisor/state")
-        if last is not None and t - last > self._max_silence:
+        if last is None:
+            last = STARTUP + (t if self._began is None else self._began)
+        if t - last > self._max_silence:
             gone.append(f"the supervisor, silent for {(t - last) / MS:.0f} ms")
         return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 

@@ -83,6 +83,7 @@ class BusWorld(World):
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
         w = np.concatenate((contact + self.weight.weight_S(R_WS) + self.bias, np.zeros(3)))
+        inbox.stamps["supervisor/state"] = t
         if not self.silent:
             inbox.put("robot/status", status(t, self.q, w))
         if self._answer_at is not None and t >= self._answer_at:
@@ -210,6 +211,15 @@ def test_targets_are_used_with_their_own_surface_alone() -> None:
         surface, targets = world.view(t)
         assert world.service._new_surface(inbox.receive({"perception/targets": targets})) is None
         assert isinstance(world.service._new_surface(inbox.receive({"perception/surface": surface})), PerceivedAbdomen)
+
+
+def test_a_supervisor_that_never_sent_anything_is_lost() -> None:
+    service, inbox = PlanningService(known(**SMALL)), HandInbox()
+    ends = []
+    for t in (0, 1200 * MS, 1300 * MS):
+        inbox.put("robot/status", status(t, HOME, np.zeros(6)))
+        ends.append(sent(service.step(t, inbox))["exam/state"])
+    assert [(end.phase, end.culprit) for end in ends[1:]] == [(Phase.LOOK, ""), (Phase.ABORTED, "supervisor/state")]
 
 
 @pytest.mark.parametrize("coincident", [False, True])
