@@ -126,7 +126,8 @@ class MotionAgreement:
         faded = exp(-since_s / self.WINDOW_S)
         self._fast = max(self._fast * faded, _largest(measured.qd))
         limit = self.LIMIT_RAD + self.LATE_S * self._fast
-        self._gap = np.clip((self._gap + moved - turned) * faded, -2 * limit, 2 * limit)  # over within the window once they agree
+        most = limit + self.LIMIT_RAD  # within the window it is over once they agree, also after a fast motion
+        self._gap = np.clip((self._gap + moved - turned) * faded, -most, most)
         if (apart := _largest(self._gap)) > limit:
             reason = f"positions and velocities disagree by {apart:.2f} rad, limit {limit:.2f} rad"
         elif self._against > 1:
