@@ -29,7 +29,7 @@ def scan() -> tuple[np.ndarray, np.ndarray, PostureSequence]:
     return positions, normals, plan_redundancy(ROBOT, positions, normals, np.array(HOME))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_functions_agree_with_the_urdf(seed: int) -> None:
     """Pose, Jacobian's rank measure and torque against pinocchio, for a base anywhere."""
     rng = np.random.default_rng(seed)
@@ -84,7 +84,7 @@ def test_what_is_out_of_reach_is_flagged_and_the_rest_is_served() -> None:
     assert not nowhere.reachable.any() and not nowhere.refined
 
 
-@pytest.mark.parametrize("count", [1, 2, 25])
+@pytest.mark.parametrize("count", [1, 25])
 def test_few_targets_and_a_wider_margin(count: int) -> None:
     positions, normals = (values[:count] for values in dome(0.05))
     postures = plan_redundancy(ROBOT, positions, normals, np.array(HOME), joint_margin_rad=0.15)

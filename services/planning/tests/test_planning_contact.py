@@ -113,7 +113,7 @@ def indent(force: Callable[[float, float], float], follow_s: float | None = None
     return np.array(rows, dtype=float)
 
 
-@pytest.mark.parametrize("newton", [0.3, 1.0, 2.4, 5.0, 9.6])
+@pytest.mark.parametrize("newton", [0.3, 2.4, 9.6])
 def test_depth_converges_on_soft_and_stiff_tissue(newton: float) -> None:
     rows = indent(lambda depth, t: hertz(newton)(depth))
     settled = rows[rows[:, 0] > 2.0]
@@ -147,7 +147,7 @@ def test_a_wrong_exponent_still_ends_at_the_limit(exponent: float) -> None:
 
 
 @pytest.mark.parametrize("follow_s", [None, 0.04])
-@pytest.mark.parametrize("exponent", [1.45, 2.4, 3.0])
+@pytest.mark.parametrize("exponent", [1.45, 3.0])
 def test_a_force_near_its_limit_does_not_swing(exponent: float, follow_s: float | None) -> None:
     rows = indent(lambda depth, t: 16.0 * (max(depth, 0.0) / 0.01) ** exponent, follow_s)
     assert rows[:, 3].max() < 13.5

@@ -217,13 +217,6 @@ def test_lost_assessment_in_contact_lifts_off() -> None:
     assert world.status.cause.reason is Reason.SERVICE_LOST
 
 
-def test_robot_away_from_home_is_brought_there() -> None:
-    world = World(known())
-    world.q = world.q + np.array([0.4, 0.1, 0.0, 0.2, 0.0, -0.1, 0.5])
-    world.run_to(Phase.PLAN)
-    assert np.abs(world.q - world.exam._views.postures[0]).max() < 0.02
-
-
 def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None:
     speeds = [np.linalg.norm(s.V_WD[:3]) for s, row in zip(snake.setpoints, snake.rows, strict=True) if row[0] is Phase.SCAN]
     assert np.median(speeds) == pytest.approx(0.03, rel=0.05)

@@ -13,7 +13,6 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.patterns import LIMITS
 from palpate_models.scenario.schema import Mode, Robot
-from palpate_planning.interruptions import Displacement
 from palpate_planning.motion.kinematics import IkSolution
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.reasons import Cause
@@ -197,16 +196,6 @@ def test_the_speed_limit_holds_between_strokes() -> None:
     while not motion.travel(path.length):
         travelled.append(motion.along.velocity)
     assert [max(lifted), max(travelled)] == pytest.approx([0.012, 0.012], rel=1e-3)
-
-
-def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:
-    path, gap = dome_path(1), np.array((0.0, 0.004, 0.003))
-    setpoint, displacement = stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0), Displacement(gap, 0.01)
-    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD + gap)
-    while not displacement.shrink(0.1):
-        pass
-    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD)
-    assert np.array_equal(stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0).p_WD, setpoint.p_WD)
 
 
 def test_the_target_is_the_one_reached_last() -> None:
