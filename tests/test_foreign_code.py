@@ -178,7 +178,7 @@ def test_a_result_that_takes_longer_to_read_than_its_child_to_end_is_returned() 
     assert run_apart(lambda _: Called(sleep, 0.4)) is None
 
 
-@pytest.mark.parametrize("how", ["exit0", "leave", "terminate", "hang"])
+@pytest.mark.parametrize("how", ["leave", "terminate", "hang"])
 def test_separate_processes_name_it_too(how: str) -> None:
     rest = ("planning", *(role for role in ROLES if role not in ("tissue", "planning")))
     patience = Patience(foreign=frozenset({"tissue"}), foreign_step=2.0)

@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,13 +61,45 @@ def test_a_failed_observer_or_tap_does_not_end_a_composed_run() -> None:
 PAIR = ("planning", "perception")
 
 
-@pytest.mark.parametrize("groups", [APART, with_own_process(LOOP, PAIR), [ROLES[::2], ROLES[1::2]]])
-def test_every_placement_gives_the_run_hash_of_the_composed_run(groups: Sequence[tuple[str, ...]]) -> None:
-    outcome = run_toys(groups=groups)
-    assert outcome.failure is None
+def assert_undisturbed(outcome: RunResult) -> None:
+    """A run in processes is that in one process."""
+    assert (outcome.failure, outcome.lost) == (None, {})
     assert outcome.sim_time_s * NS == toy_services.END
     assert outcome.run_hash == composed_hash()
     assert set(outcome.counters) == set(ROLES)
+
+
+def test_every_placement_gives_the_run_hash_of_the_composed_run_and_the_first_diagnostics_include_who_joined_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("palpate_conductor.diagnostics.TUNING", ContractWatchTuning(poll_s=3600.0))
+    first: list[DiagnosticStatus] = []
+
+    def keep(running: Running) -> None:
+        first.extend(running.conductor.diagnose() if running.conductor.elapsed_s and not first else ())
+
+    assert_undisturbed(run_toys(keep, groups=APART))
+    topics = {f"palpate/topic/{topic.name}" for topic in contract().topics.values() if topic.producer in ROLES}
+    levels = {status.level for status in first if status.name in topics}
+    assert levels
+    assert DiagnosticStatus.STALE not in levels
+
+
+def test_garbage_and_foreign_messages_are_counted_and_ignored_and_who_computes_for_long_is_not_frozen() -> None:
+    def shout(running: Running) -> None:
+        numbered = (9).to_bytes(8, "little") + bytes(8) + b"\x10" + bytes(16)
+        for topic in contract().topics.values():
+            key = topic_key(topic, 0)
+            running.session.put(key, b"\xff" * 40)
+            for attachment in (b"not an attachment", bytes(16) + b"\x10" + bytes(16), numbered):
+                running.session.put(key, b"\xff" * 40, attachment=attachment)
+
+    patience = Patience(frozen=0.2, asleep=0.5)
+    outcome = run_toys(once(0.2, shout), {"TOY_CONTROL_COMPUTES_AT": "400"}, patience, groups=with_own_process(LOOP, PAIR))
+    assert_undisturbed(outcome)
+    garbage, foreign = (sum(report[kind] for report in outcome.counters.values()) for kind in ("garbage", "foreign"))
+    assert garbage >= 2
+    assert foreign >= 1
 
 
 def test_all_roles_of_a_killed_process_are_lost_and_the_others_run_one_more_second() -> None:
@@ -131,32 +163,8 @@ def test_a_run_that_was_paused_and_stepped_has_the_same_hash() -> None:
             stood.append((robot.tick, conductor.grants.horizon))
             conductor.grants.pace("step" if len(stood) < 3 else "resume", 2)
 
-    outcome = run_toys(pause)
-    assert outcome.failure is None
+    assert_undisturbed(run_toys(pause))
     assert [tick - stood[0][0] for tick, _ in stood] == [0, 2 * MS, 4 * MS]
-    assert outcome.run_hash == composed_hash()
-
-
-def test_a_service_that_computes_for_long_is_not_frozen() -> None:
-    outcome = run_toys(environment={"TOY_CONTROL_COMPUTES_AT": "200"}, patience=Patience(frozen=0.2, asleep=0.5))
-    assert (outcome.failure, outcome.lost) == (None, {})
-
-
-def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
-    def shout(running: Running) -> None:
-        numbered = (9).to_bytes(8, "little") + bytes(8) + b"\x10" + bytes(16)
-        for topic in contract().topics.values():
-            key = topic_key(topic, 0)
-            running.session.put(key, b"\xff" * 40)
-            for attachment in (b"not an attachment", bytes(16) + b"\x10" + bytes(16), numbered):
-                running.session.put(key, b"\xff" * 40, attachment=attachment)
-
-    outcome = run_toys(once(0.2, shout))
-    assert outcome.failure is None
-    assert outcome.run_hash == composed_hash()
-    garbage, foreign = (sum(report[kind] for report in outcome.counters.values()) for kind in ("garbage", "foreign"))
-    assert garbage >= 2
-    assert foreign >= 1
 
 
 def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
@@ -202,20 +210,6 @@ def test_a_peer_with_another_definition_of_a_message_is_named(meddled: tuple[Run
     (text,) = [text for text in meddled[0].trouble if "joint_states" in text]
     assert "topic joint_states: robot publishes sensor_msgs/msg/JointState" in text
     assert "stranger expects geometry_msgs/msg/WrenchStamped" in text
-
-
-def test_the_first_diagnostics_include_services_that_joined_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_conductor.diagnostics.TUNING", ContractWatchTuning(poll_s=3600.0))
-    first: list[DiagnosticStatus] = []
-
-    def keep(running: Running) -> None:
-        first.extend(running.conductor.diagnose() if running.conductor.elapsed_s and not first else ())
-
-    assert run_toys(keep).failure is None
-    topics = {f"palpate/topic/{topic.name}" for topic in contract().topics.values() if topic.producer in ROLES}
-    levels = {status.level for status in first if status.name in topics}
-    assert levels
-    assert DiagnosticStatus.STALE not in levels
 
 
 @pytest.fixture
@@ -301,9 +295,8 @@ def test_without_a_key_a_forged_sender_is_detected(clone: Callable[[], Clone], t
 def test_with_a_key_forged_messages_are_reported_and_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_KEY", str(make_key(tmp_path / "run.key")))
     clones = abort(), torque()
-    outcome = run_toys(lambda running: [clone(running) for clone in clones])
-    assert outcome.failure is None
-    assert outcome.run_hash == composed_hash()
+    outcome = run_toys(lambda running: [clone(running) for clone in clones], groups=[ROLES[::2], ROLES[1::2]])
+    assert_undisturbed(outcome)
     assert outcome.counters["robot"]["forged"] == 1
     for topic in ("palpate/control", "control/joint_torque"):
         assert [line for line in outcome.trouble if line.startswith(f"{topic}: ") and "tag" in line], outcome.trouble
