@@ -17,10 +17,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 FUSED = (*TINY, "exam.region_m=[0.0125, 0.03]", "phantom.edge_m=0.005", "camera.frames=8")
 """An examination of two lines on a fine mesh, whose surface is perceived to a millimetre."""
 LONG_FILES = (
-    "test_runtimes.py", "test_spoiled_recordings.py", "test_resumption.py", "test_perception_following.py",
-    "test_planning_interruptions.py", "test_fmu_build.py", "test_validation.py", "test_planning_exam.py", "test_tools_check.py",
-    "test_default_install.py", "test_fmu_interface.py", "test_foreign_code.py", "test_search.py", "test_library.py",
-    "test_twin.py", "test_services.py",
+    "test_runtimes.py", "test_spoiled_recordings.py", "test_resumption.py", "test_perception_following.py", "test_commands.py",
+    "test_planning_interruptions.py", "test_planning_waits.py", "test_fmu_build.py", "test_validation.py", "test_inputs.py",
+    "test_planning_exam.py", "test_tools_check.py", "test_fmu_interface.py", "test_foreign_code.py", "test_search.py",
+    "test_library.py", "test_compared.py", "test_planning_wall.py", "test_assessment_sampling.py",
 )  # fmt: skip
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 

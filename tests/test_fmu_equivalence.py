@@ -42,8 +42,8 @@ PERSON = "phantom={kind: person, draw: {lumps: [2, 2]}, lesions: [{centre_m: [-0
 
 @pytest.mark.parametrize(
     "settings",
-    [(), (STRAIGHT_SOON, INVOLUNTARY), (STIFFENING, VOLUNTARY, BREATHING, FINE), (PERSON, BREATHING)],
-    ids=["default", "guarding", "all", "person"],
+    [(STRAIGHT_SOON, INVOLUNTARY), (STIFFENING, VOLUNTARY, BREATHING, FINE), (PERSON, BREATHING)],
+    ids=["guarding", "all", "person"],
 )
 def test_force_torque_and_displacement_agree_over_a_sliding_path(settings: tuple[str, ...], tmp_path: Path) -> None:
     scenario = load_scenario("clean", settings)

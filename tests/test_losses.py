@@ -1,4 +1,4 @@
-"""A process of an examination is killed or frozen while the indenter is in contact."""
+"""The conductor of an examination is killed or frozen while the indenter is in contact."""
 
 import json
 import shutil
@@ -11,7 +11,6 @@ from typing import Any
 
 import psutil
 import pytest
-from examination import assert_held_and_no_harder, kill_in_contact
 
 from palpate.report.evidence import peak_force
 from palpate.report.recovery import recover_run
@@ -24,34 +23,6 @@ from palpate_bus.recordings import open_recording
 from palpate_bus.runtime.failure import FailureCode
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("role", ["planning", "control"])
-def test_without_planning_or_control_the_arm_holds_safely_and_the_force_does_not_rise(role: str, tmp_path: Path) -> None:
-    killed = kill_in_contact(role, tmp_path)
-    assert killed.named_after_s < 2.0
-    assert_held_and_no_harder(killed)
-
-
-@pytest.mark.parametrize("role", ["robot", "tissue"])
-def test_without_the_physics_the_run_ends_at_once(role: str, tmp_path: Path) -> None:
-    killed = kill_in_contact(role, tmp_path)
-    assert killed.status == 3, killed.lines
-    assert any(f"{role} lost at" in line for line in killed.lines)
-
-
-def test_without_a_viewer_the_run_continues(tmp_path: Path) -> None:
-    killed = kill_in_contact("dashboard", tmp_path)
-    assert killed.status == 0, killed.lines
-    assert killed.named_after_s < 2.0
-
-
-def test_in_wall_clock_mode_too(tmp_path: Path) -> None:
-    """Without recorder and viewer, which two shared cores cannot run in real time."""
-    killed = kill_in_contact("control", tmp_path, "--wallclock", "--record", "none")
-    assert killed.status == 3, killed.lines
-    assert killed.named_after_s < 2.0, killed.lines
-    assert json.loads((killed.folder / "report.json").read_text(encoding="utf-8"))["max_force_N"] < 15.0
 
 
 MORE_N, CLEAR_M, ATTEMPTS = 2.0, 0.005, 3

@@ -1,10 +1,12 @@
-"""Input that means harm: each kind is refused with one line, quickly and in little memory."""
+"""Input that means harm is refused with one line, quickly and in little memory; fuzzing in small."""
 
 import io
+import math
 import os
 import stat
 import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from time import process_time
 
@@ -13,8 +15,12 @@ import numpy as np
 import pytest
 import zstandard
 
+from palpate.fuzz.bus_readers import Broken, FuzzTarget
+from palpate.fuzz.fuzz import Find, FuzzPlan, attempt, campaign, choose
 from palpate_bus.mcap_records import RecordingError
+from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.recordings import open_recording
+from palpate_bus.runtime.member import CHUNK_TYPE, unpack_chunk
 from palpate_errors import UserError
 from palpate_fmu.reading import FmuError, read_description
 from palpate_inputs import Bounds, InputError, InputFile, bounds, brief, parse_json, parse_yaml, printable, read_arrays
@@ -191,3 +197,70 @@ def test_the_console_shows_foreign_text_as_it_is() -> None:
     assert shown.count(r"force[left] [/nope] \x1b]0;title") >= 4
     assert "\x1b]0" not in shown
     assert "\x1b[31m" in shown, "its own colours are still there"
+
+
+@pytest.mark.parametrize("target", choose([]), ids=lambda target: target.name)
+def test_no_input_of_a_small_campaign_breaks_anything(target: FuzzTarget) -> None:
+    done = campaign([target], FuzzPlan(30, seed=20, slow_s=math.inf))[target.name]
+    assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
+    assert done.refused < 30, "valid inputs are accepted"
+
+
+def test_a_broken_target_is_found() -> None:
+    def check(data: bytes) -> bool:
+        if len(data) > 8:
+            raise Broken("too long")
+        return True
+
+    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], FuzzPlan(500))["long"]
+    assert [find.error for find in done.finds] == ["Broken: too long"]
+    assert len(done.finds[0].data) > 8
+
+
+def _outside(_: bytes) -> bool:
+    Path("../outside-of-its-folder").write_bytes(b"")
+    return True
+
+
+def _large(_: bytes) -> bool:
+    return bool(bytearray(2 << 30))
+
+
+def _ending(_: bytes) -> bool:
+    os._exit(7)
+
+
+@pytest.mark.parametrize(
+    ("check", "sign"), [(_outside, "opens for writing"), (_large, "MemoryError"), (_ending, "the process left with status 7")]
+)
+def test_what_leaves_its_confines_is_found(check: Callable[[bytes], bool], sign: str) -> None:
+    done = campaign(
+        [FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, max_found=1)
+    )["wrong"]
+    assert [sign in find.error for find in done.finds] == [True]
+
+
+def test_choosing_targets() -> None:
+    assert {target.name for target in choose(["key", "tok*"])} == {"key", "token"}
+    with pytest.raises(UserError, match="no target 'nothing'"):
+        choose(["nothing"])
+
+
+@pytest.mark.parametrize(
+    ("topic", "stamp", "length", "data", "words"),
+    [([0, 0], [1], [2, 3], 5, "columns"), ([0, 7], [1, 1], [2, 3], 5, "topic 7 of 2"), ([0, 1], [1, 1], [2, 3], 6, "bytes")],
+)
+def test_a_chunk_that_is_not_one_piece_is_refused(
+    topic: list[int], stamp: list[int], length: list[int], data: int, words: str
+) -> None:
+    """Found by fuzzing: IndexError and ValueError came out while the recorder was writing."""
+    columns = np.array(topic, np.uint16), np.array(stamp, np.int64), np.array(stamp, np.uint32), np.array(length, np.uint32)
+    message = RecordChunk("robot", 0, ["a", "b"], *columns, np.zeros(data, np.uint8))
+    with pytest.raises(codec.CodecError, match=words):
+        unpack_chunk(codec.encode(message, CHUNK_TYPE))
+
+
+def test_an_input_that_takes_long_is_a_find() -> None:
+    find = attempt(FuzzTarget("slow", lambda _: True, lambda _: [b""]), b"x", slow_s=-1.0)
+    assert isinstance(find, Find)
+    assert "took" in find.error

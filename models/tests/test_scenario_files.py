@@ -20,7 +20,7 @@ from palpate_plugins import PluginError
 def scenario(folder: Path, text: str) -> str:
     """Return the path of a scenario file with this text."""
     path = folder / "mine.yaml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
     return str(path)
 
 
@@ -41,6 +41,9 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
         ("seed: 1\nexam: {region_m: [0.1, 0.1}\n", r"mine\.yaml, line 2, column \d+: not YAML"),
         ("- exam", r"expected a mapping of fields, not list"),
         ("exam: {", r"not YAML"),
+        ("seed: \udcff", r"mine\.yaml.*not UTF-8"),
+        ("seed: 2001-13-45", r"mine\.yaml.*month"),
+        ("seed: " + "[" * 400, r"mine\.yaml.*nested more than 50 deep"),
         ("exam:\n  depth_m: 0.01\n  depth_m: 0.02\n", r"mine\.yaml: line 3: field depth_m is given twice"),
         ("seed: 1\nexam: {}\nseed: 2\n", r"mine\.yaml: line 3: field seed is given twice"),
         ("exam: {depth_m: 0.01, speed_mps: 0.02, depth_m: 0.01}", r"line 1: field depth_m is given twice"),
@@ -72,6 +75,10 @@ def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
         (["errors.level=[poor]"], r"errors\.level = \['poor'\]"),
         (["errors.force.tara_n=1"], r"errors\.force\.tara_n = 1: unknown field\. Did you mean tare_n\?"),
         (["errors.camera=blind"], r"errors\.camera = 'blind'"),
+        (["exam.region_m.x=1"], "--set"),
+        (["exam.region_m.2=1"], "--set"),
+        (["phantom.lesions.-9=1"], "--set"),
+        (["exam.depth_m=[" + "[" * 400], "--set"),
     ],
 )
 def test_a_value_is_blamed_on_the_setting_that_wrote_it_with_unit_and_count(settings: list[str], said: str) -> None:

@@ -206,8 +206,16 @@ def test_settings_change_the_examination_of_the_cases() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "where"), [("kill", "control"), ("nan", "planning/setpoint"), ("kill", CONDUCTOR)])
-def test_a_case_is_run_and_judged(kind: str, where: str, tmp_path: Path) -> None:
-    case = run_case(FaultCase(kind, where, wallclock=False), tmp_path)
+@pytest.mark.parametrize(
+    ("kind", "where", "wallclock"),
+    [
+        *(("kill", role, False) for role in ("control", "planning", "robot", "tissue", CONDUCTOR, "dashboard")),
+        ("kill", "control", True),
+        ("nan", "planning/setpoint", False),
+    ],
+)
+def test_a_case_is_run_and_judged(kind: str, where: str, wallclock: bool, tmp_path: Path) -> None:
+    """The force rises no further, and the role is named; without a viewer the run continues."""
+    case = run_case(FaultCase(kind, where, wallclock), tmp_path)
     assert case.passed, case
-    assert case.outcome is CaseOutcome.ENDED
+    assert (case.outcome is CaseOutcome.ENDED) == (where != "dashboard")

@@ -1,9 +1,11 @@
-"""`palpate reproduce`: pictures of the scene, the graph of the bus, and the page of the measurements."""
+"""`palpate reproduce`: pictures, the graph of the bus, the page of measurements; the micro-benchmarks of asv run."""
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,3 +94,34 @@ def test_the_page_is_made_of_runs(tmp_path: Path) -> None:
     images = sorted((tmp_path / "images" / "reproduction").glob("*.png"))
     assert len(images) == 6
     assert all(image.stat().st_size < 400_000 for image in images)
+
+
+FOLDER = Path(__file__).parents[2] / "asv" / "benchmarks"
+
+
+def benchmarks(name: str) -> dict[str, Any]:
+    return runpy.run_path(str(FOLDER / f"{name}.py"))
+
+
+@pytest.mark.parametrize("by", ["palpate", "rosbags"])
+def test_codec(by: str) -> None:
+    codec = benchmarks("codec")["Codec"]()
+    codec.setup("joint_state", by)
+    codec.time_encode()
+    codec.time_decode()
+
+
+@pytest.mark.parametrize(
+    ("tissue", "kind", "of"),
+    [
+        ("Abdomen", "surface", "linear"),
+        ("Abdomen", "surface", "guarding"),
+        ("FlatPatch", "surface", 700),
+        ("FlatPatch", "elastic", 700),
+    ],
+)
+def test_a_step_of_the_tissue(tissue: str, kind: str, of: object) -> None:
+    pressed = benchmarks("tissue")[tissue]()
+    pressed.setup(kind, of)
+    pressed.time_step()
+    assert len(pressed.body.contacts) > 3

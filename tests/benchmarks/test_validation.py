@@ -6,8 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings, strategies as st
-from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
 from palpate_errors import ExitStatus
@@ -29,7 +27,7 @@ SECTIONS: dict[str, Callable[[], PageSection]] = {
     "surface tier against Hertz": lambda: hertz.section(hertz.measure((0.020,))),
     "mesh halving, lumps against the continuum, superposition": meshes.section,
     "relaxation": relaxation.section,
-    "some living people": lambda: people.section(people.measure(relaxed_people()[::16])),
+    "some living people": lambda: people.section(people.measure(relaxed_people()[::40])),
     "random cycles": lambda: energy.section(energy.measure(8)),
     "population": lambda: population.section(population.sample_persons(100)),
     "buried lumps against finite elements": buried.section,
@@ -71,21 +69,6 @@ def test_the_continuum_is_winklers_without_shear() -> None:
 def test_a_loop_loses_what_does_not_come_back() -> None:
     depth = np.array((0.0, 1.0, 2.0, 1.0, 0.0)) * 1e-3
     assert people.HysteresisLoop(0.01, depth, np.array((0.0, 1.0, 2.0, 0.5, 0.0))).lost_percent == pytest.approx(25.0)
-
-
-WAVES = arrays(float, (3, 3), elements=st.floats(-1, 1))
-
-
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
-@given(WAVES, WAVES.map(lambda w: np.pi * w), st.integers(80, 600), st.sampled_from((0.0, 0.3, 1.5)))
-def test_no_closed_cycle_yields_work(amplitude: np.ndarray, phase: np.ndarray, steps: int, friction: float) -> None:
-    """Fast ones too: 80 ms for 16 mm of depth and 60 mm sideways."""
-    path = energy.closed_path(amplitude, phase, steps)
-    np.testing.assert_allclose(path[0], path[-1], atol=1e-9)
-    cycle = energy.run_cycle(energy.lumpy_phantom(), path, friction)
-    assume(cycle.touched > 20)
-    assert cycle.gained <= 0
-    assert cycle.surplus <= 1e-4
 
 
 def test_a_source_of_energy_is_detected() -> None:

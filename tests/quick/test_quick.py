@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,7 @@ def test_the_tissue_relaxes_and_recovers() -> None:
     assert again < other.press((0.03, 0.03), depth=0.010, speed=0.02, hold=0.5).force[-1] < first
 
 
+@cache
 def long_press(breath: str, following: str) -> Touch:
     words = ("errors=none", f"phantom.breathing.kind={breath}", f"exam.breathing={following}")
     return Patient(scenario(1, settings=words)).press((0.0, 0.0), 0.008, 0.02, 5.0)

@@ -1,5 +1,6 @@
-"""Proposed mappings: tables of many writers."""
+"""Proposed mappings of tables of many writers, and recordings of real robots, which are not part of the project."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
+from palpate.interface.assessment import assess
 from palpate.recording import readings
 from palpate.recording.command import scenario_of
 from palpate.recording.inspect import propose
@@ -176,3 +178,30 @@ def test_a_recording_without_a_map_has_a_report_and_status_2(file: Path, tmp_pat
 def test_an_unusable_table_is_refused_in_one_line(table: pd.DataFrame, text: str, file: Path) -> None:
     with pytest.raises(UserError, match=text):
         proposed(file, table)
+
+
+FOLDER = Path(os.environ.get("PALPATE_RECORDINGS", "missing"))
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+KNOWN = {
+    "vessel-at-2-mm": ("probingRAL2018_T1.csv", "probes", (-6, 45), 8, 1),
+    "vessel-at-3-mm": ("probingRAL2018_T2.csv", "probes", (-6, 45), 8, 1),
+    "ball": ("region_small_balls.csv", "probes", (-30.5, 65), 3, 1),
+    "vessel-in-a-slide": ("ContPalpRAL18T1.csv", "slide", (1, -13), 6, 1),
+    "liver": ("pig_liver_20150826_region1.csv", "probes", None, 0, 0),
+    "liver-to-3-mm": ("pig_liver_20150826_v2_region1.csv", "probes", None, 0, 0),
+}
+
+
+@pytest.mark.parametrize(("name", "mapping", "place_mm", "near_mm", "most"), KNOWN.values(), ids=KNOWN)
+def test_a_real_body_gives_what_is_known_of_it(
+    name: str, mapping: str, place_mm: tuple[float, float] | None, near_mm: float, most: int
+) -> None:
+    if not (FOLDER / name).is_file():
+        pytest.skip("PALPATE_RECORDINGS has no such recording")
+    recording = read_recording(FOLDER / name, EXAMPLES / f"{mapping}.yaml")
+    found = assess(recording)
+    places = 1e3 * found.findings[["x_m", "y_m"]].to_numpy(float)
+    assert len(places) <= most
+    if place_mm is not None:
+        assert np.linalg.norm(places - place_mm, axis=1).min() < near_mm
+    assert found.map.background == pytest.approx(float(np.median([sample.force for sample in recording.samples()])), rel=0.05)

@@ -9,21 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate_bus import messages as msg
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import (
-    MS,
-    CameraTrigger,
-    Image,
-    Quaternion,
-    RegionOfInterest,
-    TFMessage,
-    Transform,
-    TransformStamped,
-    Vector3,
-    header,
-    nanoseconds,
-)
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.geometry import camera_info, transform_matrix
 from palpate_bus.recordings import open_recording
@@ -48,7 +36,7 @@ TAKEN = count(5)
 
 
 def link(parent: str, child: str, q: tuple[float, ...] = HALF, p: tuple[float, ...] = (0.1, 0.2, 0.3)) -> Any:
-    return TransformStamped(header(0, parent), child, Transform(Vector3(*p), Quaternion(*q)))
+    return msg.TransformStamped(msg.header(0, parent), child, msg.Transform(msg.Vector3(*p), msg.Quaternion(*q)))
 
 
 TREE = [link("world", "stand", (0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)), (1.0, 0.0, 0.0)),
@@ -58,12 +46,12 @@ TREE = [link("world", "stand", (0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)),
 def ros_image() -> Any:
     padded = np.zeros((2, 3 * 2 + 5), np.uint8)  # drivers may pad their rows
     padded[:, : 3 * 2] = np.nan_to_num(METRES * 1000).round().astype("<u2").view(np.uint8)
-    return Image(header(next(TAKEN), FRAME), 2, 3, "16UC1", 0, padded.shape[1], padded.ravel())
+    return msg.Image(msg.header(next(TAKEN), FRAME), 2, 3, "16UC1", 0, padded.shape[1], padded.ravel())
 
 
 def ros_info(d: float = 0.0) -> Any:
     K = np.array(((600.0, 0, 1.0), (0, 610.0, 0.5), (0, 0, 1)))
-    return replace(camera_info(header(5, FRAME), (2, 3), K), d=np.full(5, d))
+    return replace(camera_info(msg.header(5, FRAME), (2, 3), K), d=np.full(5, d))
 
 
 class Port(CameraPort):
@@ -87,18 +75,18 @@ class Seen:
 
     def __init__(self) -> None:
         depth = np.full((HEIGHT, WIDTH), 0.75, "<f4")
-        self.image = Image(header(5, FRAME), HEIGHT, WIDTH, "32FC1", 0, 4 * WIDTH, depth.view(np.uint8).ravel())
+        self.image = msg.Image(msg.header(5, FRAME), HEIGHT, WIDTH, "32FC1", 0, 4 * WIDTH, depth.view(np.uint8).ravel())
         self.k = np.array([600.0, 0, 3.5, 0, 610.0, 2.5, 0, 0, 1])
         self.d = np.zeros(5)
         self.size = (HEIGHT, WIDTH)
         self.info_frame = FRAME
         self.binning_x = 0
-        self.roi = RegionOfInterest(0, 0, 0, 0, False)
+        self.roi = msg.RegionOfInterest(0, 0, 0, 0, False)
         self.transforms = [link("world", FRAME)]
 
     @property
     def info(self) -> Any:
-        plain = camera_info(header(5, self.info_frame), self.size, self.k.reshape(3, 3))
+        plain = camera_info(msg.header(5, self.info_frame), self.size, self.k.reshape(3, 3))
         return replace(plain, d=self.d, binning_x=self.binning_x, roi=self.roi)
 
 
@@ -108,9 +96,9 @@ def bridged(seen: Seen, _: Path) -> Service:
 
 def replayed(seen: Seen, folder: Path) -> Service:
     recorder = RecorderService(folder / "recording_mcap")
-    for topic, message in ((IMAGE, seen.image), (INFO, seen.info), (POSE, TFMessage(seen.transforms))):
+    for topic, message in ((IMAGE, seen.image), (INFO, seen.info), (POSE, msg.TFMessage(seen.transforms))):
         row = contract().topics[topic]
-        recorder.record(row, encode(message, row.type), 5 * MS, 1)
+        recorder.record(row, encode(message, row.type), 5 * msg.MS, 1)
     recorder.finish()
     return ReplayedCamera(open_recording(folder / "recording_mcap"))
 
@@ -142,7 +130,7 @@ REFUSED = [
     ("k", k(last=2.0), "k = .*expected fx, 0, cx"),
     ("k", np.eye(3).ravel(), r"k = .*principal point|k = .*focal"),
     ("binning_x", 2, "binning or a region of interest"),
-    ("roi", RegionOfInterest(0, 1, HEIGHT // 2, WIDTH // 2, False), "binning or a region of interest"),
+    ("roi", msg.RegionOfInterest(0, 1, HEIGHT // 2, WIDTH // 2, False), "binning or a region of interest"),
     ("size", (HEIGHT // 2, WIDTH // 2), "is 8 x 6, .*camera_info says 4 x 3"),
     ("size", (WIDTH, HEIGHT), "is 8 x 6, .*camera_info says 6 x 8"),
     ("info_frame", "color", "camera_info is in frame 'color'"),
@@ -239,7 +227,7 @@ def test_the_newest_valid_chain_is_the_pose(camera: Camera, tmp_path: Path, tran
 
 def asked(frames: int) -> HandInbox:
     """Return an inbox with a trigger for this number of frames."""
-    return HandInbox().put("planning/camera_trigger", CameraTrigger(header(0), frames))
+    return HandInbox().put("planning/camera_trigger", msg.CameraTrigger(msg.header(0), frames))
 
 
 def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
@@ -255,7 +243,7 @@ def test_a_burst_is_passed_on_by_the_contract_and_old_frames_are_not() -> None:
         out = service.step(t, inbox)
         for name, message in out.items():
             assert violations(contract().topics[name], message) == []
-            assert nanoseconds(message.header.stamp) == t
+            assert msg.nanoseconds(message.header.stamp) == t
         assert set(out) == {IMAGE, INFO} | small
     port.waiting = [ros_image()]
     assert set(service.step(300_000_000, inbox)) == small
@@ -269,11 +257,11 @@ def test_an_image_has_the_time_of_its_exposure_unless_its_clock_is_another(age_m
     """A camera's image is some 50 to 120 ms old when it comes, in which a wall that breathes moves by half a millimetre."""
     port = Port()
     image = ros_image()
-    now = nanoseconds(image.header.stamp) + age_ms * MS
+    now = msg.nanoseconds(image.header.stamp) + age_ms * msg.MS
     service = RosCameraService(port, now=lambda: now)
     port.waiting = [image]
-    (depth, info) = service.step(1000 * MS, HandInbox()).values()
-    assert nanoseconds(depth.header.stamp) == nanoseconds(info.header.stamp) == stamped_ms * MS
+    (depth, info) = service.step(1000 * msg.MS, HandInbox()).values()
+    assert msg.nanoseconds(depth.header.stamp) == msg.nanoseconds(info.header.stamp) == stamped_ms * msg.MS
 
 
 def test_an_image_that_is_repeated_is_not_passed_on_as_new() -> None:
@@ -322,7 +310,7 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/ros.sock"
     node = RosNode("realsense", 0, BusOptions(listen=(endpoint,)))
     tf = node.publisher("tf_static", "tf2_msgs/msg/TFMessage", latched=True)
-    tf.publish(TFMessage(TREE))  # before anyone subscribes
+    tf.publish(msg.TFMessage(TREE))  # before anyone subscribes
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     camera = CameraPort(RosCamera(router=endpoint))

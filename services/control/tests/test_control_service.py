@@ -6,19 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.messages import (
-    MS,
-    ImpedanceSetpoint,
-    JointState,
-    Point,
-    Pose,
-    Quaternion,
-    RobotStatus,
-    blank,
-    duration_message,
-    header,
-    nanoseconds,
-)
+from palpate_bus import messages as msg
+from palpate_bus.messages import MS, blank, header
 from palpate_bus.testing import HandInbox
 from palpate_control import impedance
 from palpate_control.service import ControlService, create
@@ -30,20 +19,20 @@ EXPIRY = 50 * MS
 
 
 def joints(t: int, q: np.ndarray = HOME, names: tuple[str, ...] = JOINT_NAMES) -> Any:
-    return JointState(header(t), list(names), np.array(q, dtype=float), np.zeros(7), np.zeros(7))
+    return msg.JointState(header(t), list(names), np.array(q, dtype=float), np.zeros(7), np.zeros(7))
 
 
-def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_JOINT, **changes: Any) -> Any:
-    pose = Pose(Point(0.3, 0.0, 1.5), Quaternion(1.0, 0.0, 0.0, 0.0))
+def setpoint(t: int, valid: int = 250 * MS, mode: int = msg.ImpedanceSetpoint.MODE_JOINT, **changes: Any) -> Any:
+    pose = msg.Pose(msg.Point(0.3, 0.0, 1.5), msg.Quaternion(1.0, 0.0, 0.0, 0.0))
     joints = {"joint_position": np.array(HOME) + 0.1, "joint_velocity": np.zeros(7), "joint_stiffness": np.full(7, 500.0)}
     axes = {"stiffness": np.full(6, 200.0), "damping_ratio": np.full(6, 0.8)}
-    fields = {"mode": mode, "pose": pose, "valid_for": duration_message(valid), **axes, **joints, **changes}
+    fields = {"mode": mode, "pose": pose, "valid_for": msg.duration_message(valid), **axes, **joints, **changes}
     return replace(blank("palpation_msgs/msg/ImpedanceSetpoint", t, "world"), **fields)
 
 
 def status(t: int) -> Any:
     rest = dict.fromkeys(("velocity", "applied_torque", "measured_torque"), np.zeros(7))
-    return replace(blank("palpation_msgs/msg/RobotStatus", t), mode=RobotStatus.MODE_ACTIVE, position=np.array(HOME), **rest)
+    return replace(blank("palpation_msgs/msg/RobotStatus", t), mode=msg.RobotStatus.MODE_ACTIVE, position=np.array(HOME), **rest)
 
 
 class Rig:
@@ -75,7 +64,7 @@ def rig() -> Rig:
 
 
 def valid_for(command: Any) -> int:
-    return nanoseconds(command.valid_for)
+    return msg.nanoseconds(command.valid_for)
 
 
 def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
@@ -118,7 +107,7 @@ def test_before_the_first_setpoint_torque_is_zero_and_a_long_wait_is_stated(rig:
 @pytest.mark.parametrize("level", [CommandLevel.TORQUE, CommandLevel.POSITION])
 def test_a_cartesian_setpoint_far_from_the_tool_ends_commanding(level: CommandLevel) -> None:
     rig = Rig(level)
-    rig.send(setpoint(0, mode=ImpedanceSetpoint.MODE_CARTESIAN))
+    rig.send(setpoint(0, mode=msg.ImpedanceSetpoint.MODE_CARTESIAN))
     command = rig.tick(20)
     assert valid_for(command) == 0
     assert command.culprit == "planning/setpoint"
@@ -179,7 +168,7 @@ def test_joint_states_of_no_joints_are_stale(level: CommandLevel) -> None:
     rig, none = Rig(level), np.zeros(0)
     rig.send(setpoint(0))
     rig.tick(10)
-    rest = [rig.tick(message=JointState(header(rig.t), [], none, none, none)) for _ in range(60)]
+    rest = [rig.tick(message=msg.JointState(header(rig.t), [], none, none, none)) for _ in range(60)]
     assert [valid_for(command) for command in rest] == [max(EXPIRY - (k + 1) * MS, 0) for k in range(60)]
     assert rest[-1].problem == "joint_states: the arm reports none"
 
@@ -201,7 +190,7 @@ def peak_on_the_way(delay: int, *, lagging: bool = False) -> float:
         late = 0 if rig.t < 100 * MS else (rig.t - 100 * MS) // 2 // MS * MS if lagging else delay
         measured = max(rig.t - late, 0)
         if lagging or rig.t - measured <= 15 * MS:
-            state = JointState(header(measured), list(JOINT_NAMES), moving(measured), speed, np.zeros(7))
+            state = msg.JointState(header(measured), list(JOINT_NAMES), moving(measured), speed, np.zeros(7))
         torque = rig.tick(1, message=state).torque[0]
         peak = max(peak, abs(torque)) if rig.t > 60 * MS else 0.0
     return peak
@@ -214,7 +203,7 @@ def test_late_states_wind_no_spring_up(delay: int, lagging: bool) -> None:
 
 
 def test_a_state_that_comes_again_and_again_winds_no_spring_up(rig: Rig) -> None:
-    frozen = JointState(header(0), list(JOINT_NAMES), moving(0), np.zeros(7), np.zeros(7))
+    frozen = msg.JointState(header(0), list(JOINT_NAMES), moving(0), np.zeros(7), np.zeros(7))
     for _ in range(400):
         if rig.t % (10 * MS) == 0:
             rig.send(setpoint(rig.t, joint_position=moving(rig.t)))
@@ -229,7 +218,7 @@ def test_nothing_is_compiled_in_mid_run(rig: Rig) -> None:
     assert functions
     before = [len(f.signatures) for f in functions]
     for k in range(4):
-        mode = ImpedanceSetpoint.MODE_CARTESIAN if k >= 2 else ImpedanceSetpoint.MODE_JOINT
+        mode = msg.ImpedanceSetpoint.MODE_CARTESIAN if k >= 2 else msg.ImpedanceSetpoint.MODE_JOINT
         rig.send(setpoint(rig.t - 10 * MS, mode=mode))
         rig.tick(10)
     assert rig.service.finish()["setpoints"] == 4

@@ -127,12 +127,6 @@ def test_the_weight_of_the_tool_is_added_to_a_wrench_without_it() -> None:
     assert np.linalg.norm(driver._wrench_on_sensor(np.zeros(6))[:3]) == pytest.approx(GRAVITY * scenario.robot.tool_mass_kg)
 
 
-def test_a_session_that_ends_holds(rig: Rig) -> None:
-    rig.port.emulator.session.end("the Sunrise application was stopped")
-    rig.tick(60)
-    assert hold_cause(rig)[0] == RobotStatus.CAUSE_DEVICE
-
-
 def test_expired_commands_hold_and_the_arm_stands(rig: Rig) -> None:
     rig.target = rig.target + 0.1
     rig.tick(150)

@@ -94,7 +94,7 @@ def test_friction_is_implicit() -> None:
             np.testing.assert_allclose(plant.v, v + DT * expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("joint", range(7))
+@pytest.mark.parametrize("joint", [0, 3, 6])
 def test_coulomb_friction_sticks_below_its_limit_and_slides_against_it_above(joint: int) -> None:
     robot = Robot(joint_friction_nm=0.5)
     plant = DartPlant(robot, NOMINAL)
