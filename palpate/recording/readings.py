@@ -304,11 +304,12 @@ def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -
     names = {name for _, state in states for name in state.name}
     if frame >= model.nframes or (unknown := sorted(name for name in names if not model.existJointName(name))):
         raise ReadingError(f"{source.urdf}: no {source.frame if frame >= model.nframes else 'joint ' + unknown[0]}")
-    at = {name: model.joints[model.getJointId(name)].idx_q for name in names}
-    q, poses = pinocchio.neutral(model), []
+    at = {name: model.joints[model.getJointId(name)].idx_v for name in names}
+    angles, poses = np.zeros(model.nv), []
     for _, state in states:
-        q[[at[name] for name in state.name]] = state.position  # the order may change from message to message
-        pinocchio.forwardKinematics(model, data, q)
+        angles[[at[name] for name in state.name]] = state.position  # the order may change from message to message
+        # the positions of a continuous joint are cosine and sine
+        pinocchio.forwardKinematics(model, data, pinocchio.integrate(model, pinocchio.neutral(model), angles))
         poses.append(pinocchio.updateFramePlacement(model, data, frame).homogeneous.copy())
     X = np.array(poses)
     return np.array([t for t, _ in states]), X[:, :3, 3], Rotation.from_matrix(X[:, :3, :3])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from palpate.recording.cutting import cycles, onset
 from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
-from palpate.recording.readings import ReadingError
+from palpate.recording.readings import ReadingError, _kinematics
 from palpate.recording.recording import Contact, ContactKind, loading
 from palpate_bus import messages as msg
 from palpate_bus.messages import NS, header
@@ -106,6 +106,19 @@ def test_stamps_that_repeat_are_replaced_by_the_times_of_the_log(
     recording = read_recording(tmp_path / "bag", mapped(force={"axes": "tool"}))
     assert not recording.faults
     assert len(recording.touches) == 9
+
+
+def test_a_joint_without_limits_turns_as_one_with_limits(tmp_path: Path) -> None:
+    found = []
+    for kind in ("revolute", "continuous"):
+        (tmp_path / "arm.urdf").write_text(
+            f'<robot name="arm"><link name="world"/><link name="a"/><link name="tool"/><joint name="q" type="{kind}">'
+            '<parent link="world"/><child link="a"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+            '</joint><joint name="end" type="fixed"><parent link="a"/><child link="tool"/><origin xyz="0.5 0 0"/></joint></robot>'
+        )
+        state = msg.JointState(header(0, ""), ["q"], np.array((0.5,)), np.empty(0), np.empty(0))
+        found += [*_kinematics([((0.0, 0.0), state)], Joints(topic="/q", urdf=tmp_path / "arm.urdf", frame="tool"))[1]]
+    np.testing.assert_allclose(found, [(0.5 * np.cos(0.5), 0.5 * np.sin(0.5), 0.0)] * 2, atol=1e-12)
 
 
 def test_poses_without_an_orientation_are_positions(few: pd.DataFrame, tmp_path: Path) -> None:
