@@ -35,6 +35,8 @@ _SNIFFED: Final = 100_000
 """Bytes of a table in which separator and decimal commas are sought."""
 _SHORTEST_S: Final = 0.005
 """Forces of a bag are averaged over this time."""
+_GAP: Final = 4.0
+"""Longest time between poses that is bridged, over their usual one."""
 
 
 class ReadingError(UserError):
@@ -164,29 +166,30 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
     times = values(
         (columns.time,) if columns.time else None, "s" if columns.time in table and is_date(table[columns.time]) else units.time
     )
-    quaternion = values(columns.orientation)
-    if quaternion is not None and columns.quaternion == "wxyz":
-        quaternion = np.roll(quaternion, -1, axis=1)
+    position, rotation = values(columns.position, units.length), None
+    if (quaternion := values(columns.orientation)) is not None:
+        quaternion = np.roll(quaternion, -1 if columns.quaternion == "wxyz" else 0, axis=1)
+        position, rotation = _oriented(position, quaternion, f"{name}: table.orientation")
     return Readings(
-        position=values(columns.position, units.length),
+        position=position,
         force=values(columns.force, units.force),
         time=None if times is None else times[:, 0] - times[np.isfinite(times)][0],
         probe=None if columns.probe is None else numbers_or_names(columns.probe),
-        rotation=None if quaternion is None else _turn(quaternion, f"{name}: table.orientation"),
+        rotation=rotation,
         normal=values(columns.normal),
         touch=values(columns.touch, units.length),
     )
 
 
-def _turn(quaternion: Array, name: str) -> Rotation | None:
-    """Return orientations, of those that are 0 or no number none; None if there is no other. Raises ReadingError."""
-    quaternion = np.nan_to_num(quaternion)
-    norm = np.linalg.norm(quaternion, axis=1)
-    if not norm.any():
-        return None
-    if not 0.9 < (usual := float(np.median(norm[norm > 0]))) < 1.1:
+def _oriented(position: Array, quaternion: Array, name: str) -> tuple[Array, Rotation | None]:
+    """Return positions, NaN where the orientation is 0 or no number, and orientations, None if all are. Raises ReadingError."""
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    known = np.isfinite(norm) & (norm > 0)
+    if not known.any():
+        return position, None
+    if not 0.9 < (usual := float(np.median(norm[known]))) < 1.1:
         raise ReadingError(f"{name}: its norm is {usual:.3g}; expected a quaternion, whose norm is 1")
-    return Rotation.from_quat(np.where(norm[:, None] > 0, quaternion, (0.0, 0.0, 0.0, 1.0)))
+    return np.where(known, position, np.nan), Rotation.from_quat(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
 
 
 def from_bag(path: Path, mapping: Mapping) -> Readings:
@@ -200,8 +203,8 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     repeats = any(2 * len(np.unique(stamps)) < len(stamps) for stamps in (rows[:, 0], clocks[:, 0]))
     times, force = _average(rows[:, [int(repeats), 2, 3, 4]])
     stamps, first = np.unique(clocks[:, int(repeats)], return_index=True)
-    if len(stamps) < 2:
-        raise ReadingError(f"{path}: {len(stamps)} poses; expected at least 2")
+    if len(stamps) < 2 or not len(times):
+        raise ReadingError(f"{path}: {len(stamps)} poses and {len(times)} wrenches; expected at least 2 and 1")
     inside = (times >= stamps[0]) & (times <= stamps[-1])
     if not inside.any():
         raise ReadingError(
@@ -210,8 +213,19 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
         )
     times, force = times[inside], force[inside]
     between = np.column_stack([np.interp(times, stamps, position[first, k]) for k in range(3)])
+    between[_without_pose(times, stamps)] = np.nan
     turn = None if rotation is None else Slerp(stamps, rotation[first])(times)
     return Readings(between, force, times - times[0], rotation=turn)
+
+
+def _without_pose(times: Array, stamps: Array) -> Mask:
+    """Return True for times in a gap between poses, or as far outside of them, shape (n,); `stamps` of poses, increasing [s]."""
+    if len(stamps) < 2:
+        return np.zeros(len(times), bool)
+    longest = _GAP * float(np.quantile(np.diff(stamps), 0.9))
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    bridged = (stamps[after] - stamps[after - 1] <= longest) | (times == stamps[after])
+    return np.asarray(~bridged | (np.abs(times - np.clip(times, stamps[0], stamps[-1])) > longest))
 
 
 def _average(rows: Array) -> tuple[Array, Array]:
@@ -259,7 +273,7 @@ def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tupl
         return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
     poses = ((*t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
     rows: Array = np.fromiter(((*t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for *t, p, q in poses), np.dtype((float, 9))).view(float)
-    return rows[:, :2], rows[:, 2:5], _turn(rows[:, 5:], f"{path}: orientation of {source}")
+    return rows[:, :2], *_oriented(rows[:, 2:5], rows[:, 5:], f"{path}: orientation of {source}")
 
 
 def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, Array, Rotation]:
@@ -271,9 +285,10 @@ def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, A
         for _, message in _messages(bag, path, topic, "tf"):
             for one in message.transforms:
                 p, q, name = one.transform.translation, one.transform.rotation, one.child_frame_id.strip("/")
-                links.setdefault(name, (one.header.frame_id.strip("/"), []))[1].append(
-                    (nanoseconds(one.header.stamp) / NS, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                )
+                poses = links.setdefault(name, (one.header.frame_id.strip("/"), []))[1]
+                if topic == "tf_static":  # the last one holds, however long
+                    poses.clear()
+                poses.append((nanoseconds(one.header.stamp) / NS, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     chain: list[Array] = []
     frame = source.child.strip("/")
     while frame != source.parent.strip("/"):
@@ -289,6 +304,7 @@ def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, A
         within = np.clip(stamps, known[0], known[-1])
         turned = Slerp(known, turn)(within) if len(known) > 1 else turn[np.zeros(len(stamps), int)]
         moved = np.column_stack([np.interp(within, known, rows[first, k]) for k in (1, 2, 3)])
+        moved[_without_pose(stamps, known)] = np.nan
         position, rotation = moved + turned.apply(position), turned * rotation
     return np.column_stack((stamps, stamps)), position, rotation
 

@@ -59,7 +59,7 @@ class FaultCode(StrEnum):
     TWO_TOOLS = "two_tools", "every other position is {value:.3g} m away: the table has the rows of two tools"
     DISAGREE = "disagree", "{count} of {of} contacts disagree with others at the same place"
     SHALLOW = "shallow", "{count} of {of} contacts are too shallow to be assessed"
-    INVALID = "invalid", "{count} of {of} rows have no number, or a normal of length 0"
+    INVALID = "invalid", "{count} of {of} rows have no pose, no number, or a normal of length 0"
     MOVES = "moves", "the skin is {value:.2g} m elsewhere from slide to slide: the body moves, as it does in breathing"
     ZERO = "zero", "the force is {value:.2g} N where probes begin: it was not tared"
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from palpate.recording.cutting import cycles, onset
 from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
-from palpate.recording.readings import ReadingError, _kinematics
-from palpate.recording.recording import Contact, ContactKind, loading
+from palpate.recording.readings import ReadingError, _kinematics, _without_pose
+from palpate.recording.recording import Contact, ContactKind, FaultCode, loading
 from palpate_bus import messages as msg
 from palpate_bus.messages import NS, header
 from palpate_bus.messages.typestore import store
@@ -45,6 +45,8 @@ def write(
     stamp: Callable[[int], int] = lambda t: t,
     logged: Callable[[int], int] = lambda t: t,
     oriented: bool = True,
+    topics: tuple[str, ...] = ("/wrench", "/tool_pose", "/tf", "/joints"),
+    hidden: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """Poses at 50 Hz, wrenches at 100 Hz in the axes of a tool that is turned about z, with its weight."""
     turn = Rotation.from_euler("z", 0.7)
@@ -52,16 +54,17 @@ def write(
     weighed = turn.inv().apply(table[["fx", "fy", "fz"]].to_numpy() + np.array((0.0, 0.0, -9.81 * TOOL.mass_kg)))
     with Writer(folder, version=9, storage_plugin=plugin) as bag:
         types = {"/wrench": msg.WrenchStamped, "/tool_pose": msg.PoseStamped, "/tf": msg.TFMessage, "/joints": msg.JointState}
-        topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}
+        connections = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}
 
         def send(name: str, message: object, t: int) -> None:
-            bag.write(topics[name], logged(t), store.serialize_cdr(message, types[name].__msgtype__))
+            if name in topics:
+                bag.write(connections[name], logged(t), store.serialize_cdr(message, types[name].__msgtype__))
 
         for k, (row, force) in enumerate(zip(table.itertuples(), weighed, strict=True)):
             t = round((row.t + 1000) * NS)
             wrench = msg.Wrench(msg.Vector3(*force), msg.Vector3(0.0, 0.0, 0.0))
             send("/wrench", msg.WrenchStamped(header(stamp(t), "tool"), wrench), t)
-            if k % 2 == 0:
+            if k % 2 == 0 and not hidden[0] < row.t < hidden[1]:
                 p = (row.x, row.y, row.z)
                 send("/tool_pose", msg.PoseStamped(header(stamp(t), "world"), msg.Pose(msg.Point(*p), q)), t)
                 transform = msg.TransformStamped(header(t, "world"), "tool", msg.Transform(msg.Vector3(*p), q))
@@ -130,8 +133,25 @@ def test_poses_without_an_orientation_are_positions(few: pd.DataFrame, tmp_path:
 
 def test_a_bag_without_messages_is_refused(few: pd.DataFrame, tmp_path: Path) -> None:
     write(tmp_path / "bag", few[:0], StoragePlugin.MCAP)
-    with pytest.raises(ReadingError, match="0 poses; expected at least 2"):
+    with pytest.raises(ReadingError, match="0 poses and 0 wrenches; expected at least 2 and 1"):
         read_recording(tmp_path / "bag", mapped())
+
+
+def test_a_bag_without_wrenches_is_refused(few: pd.DataFrame, tmp_path: Path) -> None:
+    write(tmp_path / "bag", few[:100], StoragePlugin.MCAP, topics=("/tool_pose",))
+    with pytest.raises(ReadingError, match="50 poses and 0 wrenches"):
+        read_recording(tmp_path / "bag", mapped())
+
+
+def test_missing_poses_are_not_made_up(few: pd.DataFrame, tmp_path: Path) -> None:
+    """Tracking is lost for 0.7 s in a descent; a slower link of tf ends early."""
+    start = few.t[few.z.iloc[500:625].idxmin()] - 0.6
+    write(tmp_path / "bag", few, StoragePlugin.MCAP, hidden=(start, start + 0.7))
+    recording = read_recording(tmp_path / "bag", mapped())
+    assert {fault.code: fault.count for fault in recording.faults}[FaultCode.INVALID] == pytest.approx(70, abs=3)
+    missing = _without_pose(np.array((0.0, 0.5, 2.9, 3.0, 6.0, 12.0)), np.array((0.0, 1.0, 2.0, 3.0, 9.0, *range(10, 40))))
+    assert missing.tolist() == [False, False, False, False, True, False]
+    assert _without_pose(np.array((39.0, 42.0, 44.0)), np.arange(40.0)).tolist() == [False, False, True]
 
 
 def pressed(depth: np.ndarray, force: np.ndarray, noise: float) -> Contact:

@@ -183,6 +183,7 @@ SPOILED = {
     "two-tools-at-once": (lambda t: of_two_tools(t).assign(t=t.t // 0.02 * 0.02), OVER_TIME, C.TWO_TOOLS),
     "noise": (lambda t: t.assign(**{name: np.random.default_rng(0).normal(0, 1, len(t)) for name in F}), OVER_TIME, C.FRAME),
     "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
+    "no-orientation": (lambda t: with_number(in_tool_axes(t), 0.0, Q, 60), oriented("xyzw"), C.INVALID),
     "header-again": (header_again, OVER_TIME, C.INVALID),
     "kilograms": (scaled(F, 1 / G), OVER_TIME, C.STIFFNESS),
     "probes-kilograms": (scaled(F, 1 / G), PROBES, C.STIFFNESS),
