@@ -41,7 +41,7 @@ class Bounds(NamedTuple):
     text_kb: int = 512
     """YAML, which is read at about 0.1 MB/s."""
     document_mb: int = 64
-    """JSON, CSV, Python and the description of an FMU."""
+    """JSON, CSV, Python, the description of an FMU, a mesh of an arm."""
     file_mb: int = 256
     """Any other file that is read as a whole."""
     unpacked_mb: int = 1024

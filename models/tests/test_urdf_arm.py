@@ -175,6 +175,13 @@ def test_a_fault_is_named_once(tmp_path: Path, changes: dict[str, Any], faults: 
     assert [[named for named in faults if named in fault] for fault in found] == [[named] for named in faults]
 
 
+def test_a_mesh_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "link.stl").open("wb") as mesh:
+        mesh.truncate(70 << 20)
+    _, faults = read_arm(write(tmp_path, **shape('mesh filename="link.stl"')))
+    assert faults == ["link link_3: mesh link.stl: 70 MB; allowed are 64 (PALPATE_BOUNDS=document_mb=...)"]
+
+
 @pytest.mark.parametrize(
     ("scale", "named"),
     [

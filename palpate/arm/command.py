@@ -14,7 +14,7 @@ Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next t
 @app.command()
 def check(arm: Name) -> None:
     """Say what an arm has, and what is missing or impossible, each with its link or joint. Starts nothing."""
-    from palpate.console import SteadyConsole, say, table
+    from palpate.console import say, table, wide_console
     from palpate.run.clearance import advice, touching
     from palpate_errors import ExitStatus
     from palpate_models.robot.arm import check_arm
@@ -39,7 +39,7 @@ def check(arm: Name) -> None:
     masses = [inertia.mass for inertia in found.inertias[1:]]
     for name, low, high, speed, torque, home, mass in zip(found.joint_names, *limits, masses, strict=True):
         rows.add_row(name, f"{low:.2f} to {high:.2f}", f"{speed:.2f}", f"{torque:.0f}", f"{home:.2f}", f"{mass:.2f}")
-    console = SteadyConsole()
+    console = wide_console()
     console.print(rows)
     elbow, shapes = found.joint_names[found.elbow[0]], sum(map(len, found.capsules))
     parts = f"flange {found.link_names[-1]}, elbow {elbow}, {shapes} collision shapes"
@@ -63,6 +63,7 @@ def place(
     from palpate.console import SteadyConsole, say
     from palpate.run.clearance import advice, clear_postures, scan_targets
     from palpate.run.inputs import check_usable
+    from palpate_errors import RunError
     from palpate_models.scenario.load import exam_input
     from palpate_planning.strokes.plan import look_postures
 
@@ -74,6 +75,8 @@ def place(
         (deep, touched), (raised, _) = (clear_postures(robot, *pair, chosen.limits) for pair in targets)
     console.print(f"pressed: {describe(robot, deep)}", soft_wrap=True)
     console.print(f"raised:  {describe(robot, raised)}", soft_wrap=True)
+    if not deep.reachable.any():
+        raise RunError(f"{arm}: this is the best base found, and it reaches no target. {touched}")
     x, y = robot.base_xy_m
     console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}")
     console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}")

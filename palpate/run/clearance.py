@@ -19,9 +19,9 @@ from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.placement.redundancy import Batch, PostureSequence, plan_redundancy
 from palpate_planning.strokes.plan import look_postures
 
-_TOOL = {"ft_sensor": "Palpate's stand-off", "indenter": "Palpate's indenter"}
+_TOOL = {"ft_sensor": "Palpate's stand-off", "indenter": "Palpate's indenter", "robot_base": "the pedestal under the base"}
 """Shapes that a URDF does not have, in messages."""
-_CHANGE = "name as flange a link further out, or write another home_rad, in the YAML file"
+_FURTHER_OUT = "name as flange a link further out"
 
 
 def touching(q: Array, robot: Robot, *, itself: bool = False) -> list[str]:
@@ -45,7 +45,7 @@ def advice(robot: Robot, *, itself: bool = False) -> str:
     if clear := [home for home, touched in pairs if not touched]:
         return f"write `home_rad: {clear[0].tolist()}`, which is clear, in the YAML file"
     if all(any("Palpate's" in pair for pair in touched) for _, touched in pairs):
-        return "no home_rad helps: name as flange a link further out"
+        return f"no home_rad helps: {_FURTHER_OUT}"
     return home_advice(found)
 
 
@@ -78,7 +78,10 @@ def clear_postures(robot: Robot, p: Array, n: Array, limits: Limits) -> tuple[Po
     touched = [touching(q, robot) if reached else [] for q, reached in zip(found.q, found.reachable, strict=True)]
     clear = found.reachable & np.array([not pairs for pairs in touched], dtype=bool)
     named = "; ".join(sorted({pair for pairs in touched for pair in pairs}))
-    text = f"{(found.reachable & ~clear).sum()} of {len(p)} postures touch: {named}: {_CHANGE}" if named else ""
+    change = "write another home_rad, or stand the base elsewhere"
+    if "Palpate's" in named:
+        change = f"{_FURTHER_OUT}, or {change}"
+    text = f"{(found.reachable & ~clear).sum()} of {len(p)} postures touch: {named}: {change}" if named else ""
     return found._replace(reachable=clear), text
 
 

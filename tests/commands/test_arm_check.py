@@ -107,5 +107,5 @@ def test_an_arm_without_a_posture_to_look_from_is_refused(tmp_path: Path) -> Non
 def test_a_placement_where_shapes_touch_does_not_count(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(TIAGO)
-    with pytest.raises(RunError, match=f"tried on .* sampled targets; .* reaches none of .*postures touch: {TOUCH}"):
+    with pytest.raises(RunError, match=r"tried on .* sampled targets; .* reaches none of .*postures touch: arm_5_link and"):
         best_placement(load_scenario("lump", [f"robot.arm={file}", "exam.region_m=[0.06,0.06]"]))

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError, restate
-from palpate_inputs import read_text
+from palpate_inputs import MB, bounds, over, read_text
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_postures
@@ -251,7 +251,7 @@ class _Reader(UrdfTree):
         poses, moving = self._link_poses(chain)
         n = len(moving)
         if n not in (6, 7):
-            return None, [f"{n} joints from {chain[0]} to {given.flange}; {self._wanted}"]
+            return None, [f"flange: {n} joint{'s' * (n != 1)} from {chain[0]} to {given.flange}; {self._wanted}"]
         lists = [(field, values) for field, values in given if field not in _NOT_PER_JOINT and isinstance(values, tuple)]
         lists += [("seeds_rad", q) for q in given.seeds_rad]
         if wrong := [f"{field}: expected {n} values, one per joint, not {len(q)}" for field, q in lists if len(q) != n]:
@@ -467,6 +467,9 @@ class _Reader(UrdfTree):
         path = _resolve(name, self._path.parent)
         if not path.is_file():
             self.faults.append(f"link {link}: mesh {name} is not there")
+            return np.zeros((0, 3))
+        if (size_mb := path.stat().st_size / MB) > bounds().document_mb:
+            self.faults.append(str(over(f"link {link}: mesh {name}", f"{size_mb:.0f} MB", "document_mb")))
             return np.zeros((0, 3))
         scale = self.numbers(mesh, "scale", "1 1 1")
         try:
