@@ -383,7 +383,7 @@ class ExaminationSequence:
         sense.compensation.update(course.contact.R_WS, now.reading.wrench_S, taring=step.taring)
         if step.stage is StrokeStage.DONE:
             self._end_strokes(now, out, palpation)
-            if palpation.recovery.failed:
+            if palpation.recovery.ending:
                 return None  # it rests where it is, which may be off the planned path
         return step.setpoint
 

@@ -4,11 +4,13 @@
 |---|---|---|
 | the last segment ends, and no `more` may follow | stays above the wall | none |
 | no request in time (`early_end`) | stays above the wall | none |
-| `leave`: patient moved, wall hidden, elbow too straight, first place without tissue, long wait | lifts and ends | `ahead` |
-| `abandon`, last allowed soft stop or place without tissue (`failed`) | lifts and ends; at once in free motion | `remaining` |
+| `leave`: patient moved, wall hidden, elbow too straight, first place without tissue, long wait | lifts and ends* | `ahead` |
+| `abandon`, last allowed soft stop or place without tissue (`failed`) | lifts and ends* | `remaining` |
 | `pause` | lifts and waits for `resume` | examined from there |
 | force at the soft-stop limit | lifts | near ones skipped, then examined |
 | wall against its forecast | lifts | examined from shortly before; skipped after several repeats |
+
+*A free motion ends at once: it has no wall to lift off from, and the arm may be off its path.
 """
 
 from collections import deque
@@ -152,11 +154,9 @@ class Palpation:
         self._segments += segments
 
     def abandon(self, cause: Cause) -> None:
-        """Lift off and end. A free motion ends at once: it has no wall to lift off from, and the arm may be off its path."""
+        """Lift off and end."""
         self.recovery.give_up(cause)
-        if self._motion.segment.free is not None:
-            self._continue_with(_report_done())
-        elif self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
+        if self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
             self._interrupt()
 
     def leave(self, cause: Cause) -> None:
@@ -348,8 +348,8 @@ class Palpation:
         self.stage = next(stages)
 
     def _interrupt(self) -> None:
-        """Lift off from whatever the arm does."""
-        self._continue_with(self._after_interruption())
+        """Lift off from whatever the arm does; end a free motion."""
+        self._continue_with(self._after_interruption() if self._motion.segment.free is None else _report_done())
 
     def _check_force(self, contact: ContactMeasurement) -> None:
         """Lift off at the soft-stop force and skip the targets there; before a sudden force, and press there again."""

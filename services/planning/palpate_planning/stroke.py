@@ -225,10 +225,7 @@ def follow(motion: StrokeMotion) -> Stages[None]:
     arrived = False
     while not arrived:
         now = yield StrokeStage.TRANSFER
-        if now.paused:
-            motion.brake()
-        else:
-            arrived = motion.follow_free_motion(now.rate)
+        arrived = motion.follow_free_motion(now.rate)
 
 
 def is_steady(stage: StrokeStage, motion: StrokeMotion, *, limited: bool) -> bool:

@@ -113,8 +113,6 @@ class StrokeMotion:
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
-        self._following = True
-        """False while a free motion pauses."""
         self._behind = False
         """True if the arm is far from the set-point of a free motion."""
         self._q_offset: Array | None = None
@@ -210,8 +208,7 @@ class StrokeMotion:
         return self.along.step(goal, max(self._speed_limit.at(self.along.position), MOTION.creep_mps))
 
     def brake(self) -> bool:
-        """Come to rest along the path; pause a free motion. Return True at rest."""
-        self._following = False
+        """Come to rest along the path; return True at rest."""
         resting = self.along.velocity <= 1e-4
         if not resting:
             self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, MOTION.creep_mps))
@@ -221,7 +218,6 @@ class StrokeMotion:
         """Advance the segment's free motion by `rate` samples; return True once the arm is at its end."""
         assert self.segment.free is not None
         last = len(self.segment.free) - 1.0
-        self._following = True
         self._sample = min(self._sample + rate, last)
         return self._sample >= last and not self.behind
 
@@ -254,7 +250,7 @@ class StrokeMotion:
     def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """Return the set-point at `t` [ns]; a free motion advances by `rate` samples a period."""
         if self.segment.free is not None:
-            return self._free_setpoint(t, contact, rate if self._following else 0.0)
+            return self._free_setpoint(t, contact, rate)
         regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self.period_s
         outward = self.wall.outward(point.p_W, t)
         rising = (self.wall.outward(point.p_W + point.dp_ds * speed * dt, t + round(dt * SECOND)) - outward) / dt

@@ -28,6 +28,7 @@ from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import TIMING, JerkLimitedAxis, RestartRamp, SpeedLimit, joint_trajectory, round_corners
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
+from palpate_planning.reasons import MOVED
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import MOTION as STROKE_MOTION, StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath, centre, least_twist
@@ -335,6 +336,13 @@ def test_an_arm_that_does_not_arrive_ends_the_strokes() -> None:
     assert steps[-1].stage is StrokeStage.DONE
 
 
+def test_strokes_that_are_left_in_a_free_motion_end_at_once() -> None:
+    palpation = free_palpation()
+    palpation.step(0, ABOVE)
+    palpation.leave(MOVED)
+    assert palpation.step(10 * MS, ABOVE).stage is StrokeStage.DONE
+
+
 class Turn:
     """A free motion of two samples."""
 
@@ -351,7 +359,7 @@ def test_a_free_motion_waits_for_an_arm_that_is_behind() -> None:
     """A pendant or a drive may slow it down."""
     motion = StrokeMotion(ExamSettings(), Limits(), Robot(), 0.01, None)  # type: ignore[arg-type]  # no wall in free motion
     motion.segment = SimpleNamespace(free=Turn())  # type: ignore[assignment]
-    motion._sample, motion._q_offset, motion._following = 0.0, None, True
+    motion._sample, motion._q_offset = 0.0, None
     motion.setpoint(0, SimpleNamespace(q=HOME, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
     rad, m = STROKE_MOTION.behind_rad, STROKE_MOTION.behind_m
     arrived = []
