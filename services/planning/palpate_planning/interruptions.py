@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from palpate_bus.messages.codes import Reason
 from palpate_bus.setpoint import Setpoint
@@ -48,7 +49,10 @@ class RecoveryTuning(NamedTuple):
     one_place_m: float = 0.010
     """Two interruptions of a stroke that are closer than this are at one place."""
     displaced_max_m: float = 0.02
-    """An arm that was pushed aside further while it was held does not continue."""
+    tilted_max_rad: float = 0.3
+    """An arm that was pushed aside further while it was held, or whose tool was tilted further, does not continue."""
+    lever_m: float = 0.1
+    """A turn by an angle takes as long as a motion by this lever times the angle."""
     clear_height_m: float = 0.003
     """Above this height an arm that was pushed aside may move laterally."""
     on_path_m: float = 1e-6
@@ -134,10 +138,12 @@ class WallWatch:
 
 
 class Displacement:
-    """Gap between an arm that was pushed aside and its path, while the arm returns."""
+    """Gap between an arm that was pushed aside or tilted and its path, while the arm returns."""
 
     def __init__(self, gap: Array, period_s: float) -> None:
-        """`gap` [m], world axes, shape (3,): measured less planned centre of the sphere; not zero."""
+        """`gap`, shape (6,), not zero: measured less planned centre of the sphere, world axes [m]; `lever_m` times the rotation
+        vector of the tool, axes of the path point [m].
+        """
         length = float(np.linalg.norm(gap))
         self._direction = gap / length
         acceleration = MOTION.transfer_acceleration_mps2
@@ -145,9 +151,11 @@ class Displacement:
 
     def move(self, setpoint: Setpoint) -> Setpoint:
         """Return the set-point, displaced by the remaining gap."""
-        V_WD = setpoint.V_WD.copy()
-        V_WD[:3] += self._direction * self._length.velocity
-        return setpoint._replace(p_WD=setpoint.p_WD + self._direction * self._length.position, V_WD=V_WD)
+        toward, turn, V_WD = self._direction[:3], self._direction[3:] / RECOVERY.lever_m, setpoint.V_WD.copy()
+        V_WD[:3] += toward * self._length.velocity
+        V_WD[3:] += setpoint.R_WD @ turn * self._length.velocity
+        R_WD, p_WD = setpoint.R_WD @ pin.exp3(turn * self._length.position), setpoint.p_WD + toward * self._length.position
+        return setpoint._replace(R_WD=R_WD, p_WD=p_WD, V_WD=V_WD)
 
     def shrink(self, speed: float) -> bool:
         """Return to the path for one period with at most `speed` [m/s]; True once there."""
@@ -234,17 +242,21 @@ class Recovery:
             return self.resume_at - MOTION.end_tolerance_m
         return position - (0.0 if measured else MOTION.end_tolerance_m)
 
-    def begin_return(self, contact: ContactMeasurement, point: PathPoint, centre_height: float) -> float:
-        """Begin the return of the arm to its path point; return its lateral distance [m] from there.
+    def begin_return(self, contact: ContactMeasurement, point: PathPoint, centre_height: float) -> Cause:
+        """Begin the return of the arm to its path point; return a cause if it is too far from there, laterally or by its tilt.
 
         `centre_height` [m]: distance of the sphere's centre from the perceived surface at zero depth.
         """
-        p_WI = contact.X_WI[:3, 3]
-        gap = p_WI - centre(point.p_W, point.n_W, centre_height, contact.depth)
+        p_WI, R_DI = contact.X_WI[:3, 3], point.R_WD.T @ contact.X_WI[:3, :3]
+        away = p_WI - centre(point.p_W, point.n_W, centre_height, contact.depth)
+        gap = np.concatenate((away, RECOVERY.lever_m * pin.log3(R_DI)))
         pushed = float(np.linalg.norm(gap)) > RECOVERY.on_path_m
         self.displacement = Displacement(gap, self._period_s) if pushed else None
-        gap = p_WI - point.p_W
-        return float(np.linalg.norm(gap - (gap @ point.n_W) * point.n_W))
+        lateral, tilt = float(np.linalg.norm(away - (away @ point.n_W) * point.n_W)), float(np.arccos(min(R_DI[2, 2], 1.0)))
+        if lateral <= RECOVERY.displaced_max_m and tilt <= RECOVERY.tilted_max_rad:
+            return NO_CAUSE
+        gaps = f"pushed {lateral * 1e3:.0f} mm off its path and tilted by {np.degrees(tilt):.0f} deg"
+        return Cause(Reason.ARM_DISPLACED, f"the arm was {gaps} while it was held")
 
     def return_to_path(self, contact: ContactMeasurement) -> None:
         """Return to the path for one period: only clear of the wall, and not while the arm waits or gives up."""

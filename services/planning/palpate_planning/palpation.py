@@ -171,8 +171,7 @@ class Palpation:
         """Lift off along the normal and wait there for `resume`."""
         self.recovery.paused = True
         if self.stage in stroke.PRESSING:
-            stop = self._motion.along.position + self._motion.stopping_distance
-            self.recovery.resume_at = min(stop, self._motion.segment.path.length)
+            self.recovery.resume_at = self._motion.along.position
             self._interrupt()
         else:
             self._rise()
@@ -185,15 +184,13 @@ class Palpation:
         self.recovery.paused = False
         if self._motion.segment.free is not None:
             return
-        centre_height = self._motion.centre_height(t)
-        lateral = self.recovery.begin_return(contact, self._motion.point, centre_height)
-        if lateral > RECOVERY.displaced_max_m:
-            self.abandon(Cause(Reason.ARM_DISPLACED, f"the arm was pushed {lateral * 1e3:.0f} mm off its path while it was held"))
+        if displaced := self.recovery.begin_return(contact, self._motion.point, self._motion.centre_height(t)):
+            self.abandon(displaced)
         self._motion.restart(contact)
 
     def skip_free_motion(self) -> None:
         """Continue with the next segment: another motion took the arm to the goal of the present free motion."""
-        self.recovery.paused = False
+        self.recovery.paused, self._motion.posture = False, None
         self._continue_with(self._remaining())
 
     def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:

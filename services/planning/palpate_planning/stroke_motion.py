@@ -85,8 +85,8 @@ class StrokeMotion:
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
         self.depth_axis = self._new_depth_axis(-SEGMENTS.hover_m)
         """Target depth [m], negative above the wall."""
-        self._posture: Array | None = None
-        """Posture of the last set-point [rad], shape (n,)."""
+        self.posture: Array | None = None
+        """Posture of the last set-point [rad], shape (n,); None: of an arm that another motion has moved, as measured."""
         self.joined = False
         """True if the commanded depth continues that of the arm; after a free motion it has to be measured first."""
 
@@ -122,12 +122,11 @@ class StrokeMotion:
     def join(self, contact: ContactMeasurement) -> None:
         """Begin at the depth of the arm, unless the commanded depth continues it already."""
         if not self.joined:
-            self.restart(contact)
-            self.joined = True
+            self.depth_axis, self.joined = self._new_depth_axis(contact.depth), True
 
     def restart(self, contact: ContactMeasurement) -> None:
-        """Continue the segment from rest where it was left, at the present depth of the arm."""
-        self.depth_axis = self._new_depth_axis(contact.depth)
+        """Continue the segment from rest where it was left, at the present depth and posture of the arm."""
+        self.depth_axis, self.posture = self._new_depth_axis(contact.depth), None
         self.along = self._path_axis(self.along.position)
 
     def shift(self, outward: float) -> None:
@@ -255,9 +254,9 @@ class StrokeMotion:
         outward = self.wall.outward(point.p_W, t)
         rising = (self.wall.outward(point.p_W + point.dp_ds * speed * dt, t + round(dt * SECOND)) - outward) / dt
         distance = self._radius + outward - regulation.command_m
-        before, step = contact.q if self._posture is None else self._posture, MOTION.posture_radps * dt
-        self._posture = np.clip(point.q, before - step, before + step)
-        point, sinking = point._replace(q=self._posture), regulation.rate - rising
+        before, step = contact.q if self.posture is None else self.posture, MOTION.posture_radps * dt
+        self.posture = np.clip(point.q, before - step, before + step)
+        point, sinking = point._replace(q=self.posture), regulation.rate - rising
         return stroke_setpoint(t, point, speed, distance, sinking, regulation.feed_forward_n)
 
     def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
@@ -276,5 +275,5 @@ class StrokeMotion:
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
         q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
         X_WI = tool_pose(q_now, self._robot)
-        self._behind, self._posture = is_behind(q_now, X_WI, contact), q_now
+        self._behind, self.posture = is_behind(q_now, X_WI, contact), q_now
         return joint_setpoint(t, X_WI, q_now, qd_now, self._arm.stiffness_nmprad)

@@ -327,6 +327,15 @@ def test_after_a_pause_in_a_free_motion_the_palpation_continues_with_the_next_se
     assert np.array_equal(steps[-1].setpoint.q, MOTION.q[-1])
 
 
+def test_after_a_stop_in_a_free_motion_the_posture_begins_where_the_arm_is() -> None:
+    free, press = Segment(PLACE, contact=False, free=MOTION), Segment(PLACE, contact=True)
+    palpation = Palpation((free, press), known(), PERIOD_S, plane(np.eye(4)), Tally())
+    palpation.step(0, ABOVE)
+    palpation.pause()
+    palpation.skip_free_motion()
+    assert palpation.step(10 * MS, ABOVE._replace(q=GOAL)).setpoint.q == pytest.approx(GOAL)
+
+
 def test_an_arm_that_does_not_arrive_ends_the_strokes() -> None:
     palpation = free_palpation()
     times = ticks(0, 10 * MS, len(MOTION) + round((WAIT.limit_s + 1) / 0.01))
