@@ -13,7 +13,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactSensing
-from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion
+from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, at_posture
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import RestartRamp
@@ -148,11 +148,15 @@ class ExaminationSequence:
         self._remainder = Remainder()
         self._requested = RequestedPresses(lockstep=lockstep)
         self._planning: BackgroundTask[ExamPlan] | None = None
+        self._planned_from: Array
+        """Posture at the start of that plan [rad], shape (n,)."""
         self.skipped: dict[int, Cause] = {}
         """Skipped targets with the cause."""
         self._started = False
         self._began: int | None = None
         """Time of the first step [ns]."""
+        self._findings_final = False
+        """True once the final findings of the assessment arrived, which are sent once."""
         self._averaged: Array | None = None
         """Height of the wall above the surface's vertices in the mean of the images since the view [m]."""
         self._phases: dict[Phase, Callable[[Observation, ExamStep], Setpoint | None]] = {
@@ -192,6 +196,7 @@ class ExaminationSequence:
                 course.enter(Phase.HOME, now.t, "going home")
         if now.averaged is not None:
             self._averaged = now.averaged
+        self._findings_final = self._findings_final or now.findings_final
         self._requested.receive(now.request)
         if now.motion is not None:
             self._sense.wall.breath.receive(now.motion, now.t)
@@ -324,6 +329,7 @@ class ExaminationSequence:
         course, remainder = self._course, self._remainder
         if self._planning is None:
             perceived, start = course.perceived, course.arm.q.copy()
+            self._planned_from = start
             assert perceived is not None
             self._planning = BackgroundTask(
                 now.t,
@@ -430,8 +436,9 @@ class ExaminationSequence:
 
     def _hold(self, now: Observation, out: ExamStep) -> Setpoint | None:
         setpoint = self._stops.step(now)
-        # What was asked for before the stop is asked for again: the arm may have been pushed since.
-        self._views.asked = self._planning = None
+        self._views.asked = None  # the camera is asked again, and an arm that was pushed gets another plan
+        if self._planning is not None and not at_posture(self._course.arm.q, self._planned_from):
+            self._planning = None
         return self._palpate(now, out) if self.status.phase in PALPATING else setpoint
 
     # --- after contact ------------------------------------------------------------------------------------------------
@@ -445,7 +452,7 @@ class ExaminationSequence:
             self._course.enter(Phase.ASSESS, now.t, FOR_FINDINGS.text, FOR_FINDINGS)
 
     def _assess(self, now: Observation, out: ExamStep) -> None:
-        if now.findings_final:
+        if self._findings_final:
             self._conclude(now.t)
         elif now.t - self._course.since > EXAM.findings_timeout_ns:
             text = f"no final findings after {EXAM.findings_timeout_ns / SECOND:.0f} s"

@@ -77,6 +77,11 @@ AT_POSTURE_RAD = 0.01
 """The arm is at a posture if all joints are closer than this."""
 
 
+def at_posture(q: Array, posture: Array) -> bool:
+    """Return True if q is at a posture [rad], shapes (n,)."""
+    return bool(np.abs(q - posture).max() < AT_POSTURE_RAD)
+
+
 class FreeMotion:
     """Moves the arm between postures without contact: holds a posture, or follows a trajectory and holds its end."""
 
@@ -114,7 +119,7 @@ class FreeMotion:
             return False
         if self._task is None:
             start = self.q.copy()
-            if float(np.abs(start - goal).max()) < AT_POSTURE_RAD:
+            if at_posture(start, goal):
                 return True
             self._task = BackgroundTask(
                 t, PLANNING_TIME, lambda: self._planner.motion(start, goal, perceived), lockstep=self._lockstep

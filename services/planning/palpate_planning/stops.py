@@ -168,8 +168,8 @@ class Stops:
     def _end(self, now: Observation, cause: Cause, *, lost: bool) -> None:
         """End the examination.
 
-        Strokes that planning moves are lifted, and the arm goes home. After a loss all others end where the arm is; otherwise
-        at home, held ones after the release.
+        Strokes that planning moves are lifted. After a loss it ends where the arm is then; otherwise at home, and a held
+        one after the release.
         """
         course, held, palpation = self._course, self._course.phase is Phase.HELD, self._palpation
         if palpation is not None:

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from unittest.mock import Mock
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from planning_fakes import BASE, PERIOD_S, RATES, SMALL, World, check_at_port, known
 
@@ -12,6 +13,7 @@ from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.robot import lbr
+from palpate_planning.contact import SensorReading
 from palpate_planning.interruptions import RECOVERY, Recovery
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import JointTrajectory
@@ -19,6 +21,7 @@ from palpate_planning.palpation import NOT_TRACKED, Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
+from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.waits import Tally
 
@@ -77,6 +80,7 @@ def test_an_arm_that_was_moved_at_the_end_of_a_stop_is_held_where_it_is() -> Non
 
 def test_an_arm_that_was_pushed_while_the_strokes_were_planned_starts_where_it_is() -> None:
     world = stopped_in(Phase.PLAN, soft=False)
+    assert world.exam._planning is not None, "the plan is kept until then"
     for _ in range(100):
         world.q = world.q + 0.0025 * np.eye(7)[0]
         world.step()
@@ -86,7 +90,10 @@ def test_an_arm_that_was_pushed_while_the_strokes_were_planned_starts_where_it_i
 
 
 def test_a_soft_stop_that_becomes_an_emergency_stop_is_left_to_the_driver_and_nothing_pulls_at_the_arm() -> None:
-    world = stopped_in(Phase.SCAN, soft=True, seconds=0.05)
+    world = stopped_in(Phase.SCAN, soft=True, seconds=0.0)
+    felt = palpation_of(world)._motion.along.position
+    world.steps(5)
+    assert palpation_of(world).recovery.resume_at == felt, "the braking distance was not felt"
     world.soft, there = False, world.q
     world.q = there + 0.01
     setpoint = world.step().setpoint
@@ -166,6 +173,33 @@ def test_an_arm_that_was_pushed_a_little_lifts_before_it_returns(phase: Phase) -
     world.stop = NO_CAUSE
     assert drawn_sideways(world) < 0.002
     world.complete()
+
+
+@pytest.mark.parametrize("tilt", [0.15, 0.45])
+def test_a_tool_that_was_tilted_lifts_before_it_turns_back_without_a_leap_or_gives_up(tilt: float) -> None:
+    world = stopped_in(Phase.SCAN, soft=False, seconds=0.1)
+    X, held = world.kinematics.pose(world.q), len(world.setpoints)
+    for angle in np.linspace(0.0, tilt, 20):
+        turned = X.copy()
+        turned[:3, :3] = pin.exp3(np.array((angle, 0.0, 0.0))) @ X[:3, :3]
+        world.q = world.kinematics.solve(turned, world.q).q
+        world.step()
+    world.stop = NO_CAUSE
+    world.run()
+    check_at_port(world.setpoints[held:])
+    assert world.end == ((Phase.ABORTED, Reason.ARM_DISPLACED) if tilt > RECOVERY.tilted_max_rad else (Phase.DONE, Reason.NONE))
+
+
+def test_final_findings_that_arrive_in_a_stop_are_kept() -> None:
+    world = World(known(**SMALL))
+    world.step()
+    world.exam._course.enter(Phase.ASSESS, world.t, "waiting for the findings")
+    world.stop = STOPPED
+    world.step()
+    world.stop = NO_CAUSE
+    world.step()
+    world.exam.step(Observation(world.t, SensorReading(world.t, world.q, np.zeros(6), np.zeros(7))))
+    assert world.status.phase is Phase.DONE
 
 
 def test_an_arm_that_was_pushed_into_the_tissue_between_strokes_lifts_first() -> None:
