@@ -49,8 +49,9 @@ class RecoveryTuning(NamedTuple):
     one_place_m: float = 0.010
     """Two interruptions of a stroke that are closer than this are at one place."""
     displaced_max_m: float = 0.02
+    """An arm that was pushed aside further while it was held does not continue."""
     tilted_max_rad: float = 0.3
-    """An arm that was pushed aside further while it was held, or whose tool was tilted further, does not continue."""
+    """An arm whose tool was tilted further while it was held does not continue."""
     lever_m: float = 0.1
     """A turn by an angle takes as long as a motion by this lever times the angle."""
     clear_height_m: float = 0.003
