@@ -22,13 +22,12 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
 from palpate_models.numerics.frames import Array, matrix, rigid
-from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.motion import Breathing
 from palpate_models.patient.schema import Background, Phantom, Stiffness
 from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import ArmErrors, DrawnArm, Errors
 from palpate_models.scenario.load import plant_input, true_pose
-from palpate_models.scenario.schema import Robot, Scenario
+from palpate_models.scenario.schema import CommandLevel, Robot, Scenario
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint, joint_setpoint
 from palpate_planning.strokes.path import least_twist

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient, felt_patient
-from palpate_assessment.assess import assess
-from palpate_assessment.grid import MapGrid
+from palpate_assessment.assess import MapGrid, assess
 from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.schema import Background, Build, Phantom, Stiffness

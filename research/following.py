@@ -26,8 +26,7 @@ from palpate_bus.messages import (
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.numerics.frames import Array, apply, inverse, matrix
-from palpate_models.patient.breathing import BreathingCurve
-from palpate_models.patient.motion import BodyMotion
+from palpate_models.patient.motion import BodyMotion, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.arm import link_transforms, tool_jacobian, tool_pose
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input, true_pose

@@ -26,13 +26,13 @@ from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting
 from palpate.quick.patient import PERIOD_S
 from palpate.report.evidence import FILE, points, read_evidence
 from palpate.truth.pressed import TrueBody, TrueSurface
-from palpate_assessment.seen_breath import BreathingShares, depth_seen
+from palpate_assessment.sampling import BreathingShares, depth_seen
 from palpate_assessment.service import SEEN, skin_of
 from palpate_bus.messages import NS, ExamState, nanoseconds
 from palpate_bus.messages.geometry import vectors
 from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply, matrix
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import exam_input, load_scenario, true_pose
 from palpate_models.scenario.schema import Scenario

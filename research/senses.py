@@ -29,9 +29,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_supervisor.judge import SensorJudge
-from palpate_supervisor.senses import ForceComparison, Measurement
+from palpate_supervisor.senses import ForceComparison, Measurement, ToolSense
 from palpate_supervisor.service import TUNING as SUPERVISOR
-from palpate_supervisor.tool import ToolSense
 
 PERIOD_S: Final = 0.01
 PRESSED_N: Final = 3.0

@@ -8,7 +8,7 @@ import pytest
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

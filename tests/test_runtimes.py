@@ -31,8 +31,8 @@ from palpate_bus.wire.transport import Subscription
 from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.diagnostics import ContractWatchTuning
 from palpate_conductor.outcome import Patience, RunFailed, RunResult
+from palpate_conductor.watchdog import ContractWatchTuning
 from palpate_errors import UserError
 
 
@@ -72,7 +72,7 @@ def assert_undisturbed(outcome: RunResult) -> None:
 def test_every_placement_gives_the_run_hash_of_the_composed_run_and_the_first_diagnostics_include_who_joined_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("palpate_conductor.diagnostics.TUNING", ContractWatchTuning(poll_s=3600.0))
+    monkeypatch.setattr("palpate_conductor.watchdog.TUNING", ContractWatchTuning(poll_s=3600.0))
     first: list[DiagnosticStatus] = []
 
     def keep(running: Running) -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.breathing import TABLE_S, Breathing, BreathingCurve
+from palpate_models.patient.motion import TABLE_S, Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom
 from palpate_validation.check import COLOURS, INK, Check, PageSection

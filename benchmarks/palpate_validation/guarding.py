@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
+from palpate_models.patient.healthy import tension_of_ratio
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Stiffness
-from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import FADING_S, MEDIAN, Guarding
 from palpate_models.scenario import press
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

@@ -11,10 +11,9 @@ from scipy import stats
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient import remus2024
-from palpate_models.patient.healthy import belly, healthy_wall
+from palpate_models.patient.healthy import belly, healthy_wall, pressed_force
 from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Build, Phantom
-from palpate_models.patient.tension import pressed_force
 from palpate_validation.check import COLOURS, INK, Check, PageSection
 
 
@@ -73,7 +72,7 @@ def sample_persons(persons: int = SETUP.persons) -> pd.DataFrame:
     """Return persons of the seeds 0, 1, 2 .., each pressed at `SETUP.places` random positions of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
-    (`palpate_models.patient.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
+    (`palpate_models.patient.healthy.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
     offset is the fits' median.
     """
     offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))

@@ -24,7 +24,7 @@ from palpate_bus.runtime.member import CHUNK_TYPE, unpack_chunk
 from palpate_errors import UserError
 from palpate_fmu.reading import FmuError, read_description
 from palpate_inputs import Bounds, InputError, InputFile, bounds, brief, parse_json, parse_yaml, printable, read_arrays
-from palpate_models.patient.mesh_file import MeshError, read_mesh
+from palpate_models.patient.mesh import MeshError, read_mesh
 from palpate_models.scenario.load import ScenarioError, load_scenario
 
 ALIASES = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{','.join(9 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))

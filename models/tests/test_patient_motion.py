@@ -9,13 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import apply
 from palpate_models.patient import remus2024, wall
-from palpate_models.patient.breathing import MOST_M, TABLE_S, Breathing, BreathingCurve
-from palpate_models.patient.mesh_file import MeshError
-from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.patient.healthy import pressed_force, tension_of_ratio
+from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.motion import MOST_M, TABLE_S, BodyMotion, Breathing, BreathingCurve, Motion
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import curve, curves, exponent, fitted, relaxed_people
 from palpate_models.patient.schema import Phantom, Stiffness
-from palpate_models.patient.tension import pressed_force, tension_of_ratio
 from palpate_models.patient.wall import Activation, Guarding
 
 QUIET = Breathing(kind="quiet")

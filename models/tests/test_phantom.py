@@ -11,13 +11,12 @@ from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
 from palpate_models.patient.abdomen import bone_share, parametric_surface
-from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import at_skin, background_factor, gaussian_field, lesion_field
-from palpate_models.patient.grid import BodyGrid, read_grid
 from palpate_models.patient.healthy import belly, healthy_wall
-from palpate_models.patient.mesh_file import MeshError
+from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.motion import Breathing
 from palpate_models.patient.person import PEOPLE, draw_person, under_fat
-from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.phantom import BodyGrid, build_phantom, read_grid
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.schema import (
     Anatomy,

@@ -6,8 +6,7 @@ import trimesh
 
 from palpate_models.numerics.frames import look_at
 from palpate_models.patient.abdomen import parametric_surface
-from palpate_models.patient.mesh import orient, refine
-from palpate_models.patient.mesh_file import MeshError
+from palpate_models.patient.mesh import MeshError, orient, refine
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Phantom
 

@@ -18,8 +18,8 @@ def check(arm: Name) -> None:
     from palpate.run.clearance import advice, touching
     from palpate_errors import ExitStatus
     from palpate_models.robot.arm import check_arm
-    from palpate_models.scenario.arm_file import DEFAULT_ARM, arm_file
     from palpate_models.scenario.load import exam_input, load_scenario
+    from palpate_models.scenario.schema import DEFAULT_ARM, arm_file
     from palpate_planning.strokes.plan import look_postures
 
     found, faults = check_arm(arm)

@@ -19,8 +19,7 @@ from palpate_models.numerics.frames import Array, Mask
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.table import BASE_SIDE_M, TABLE
 from palpate_models.scenario.schema import Robot, Scenario
-from palpate_planning.placement.redundancy import POSTURES, PostureSequence, plan_redundancy
-from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
+from palpate_planning.placement.redundancy import POSTURES, PostureSequence, arm, base_of, casadi, plan_redundancy, surface_frames
 
 
 class PlacementTuning(NamedTuple):

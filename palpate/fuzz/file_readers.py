@@ -37,9 +37,9 @@ from palpate_fmu.reading import DESCRIPTION, binary_folders, read_description, r
 from palpate_inputs import parse_json
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh import load_mesh
-from palpate_models.scenario.checkpoint import Checkpoint, FeltSoFar, read_checkpoint
+from palpate_models.scenario.checkpoint import FELT, Checkpoint, read_checkpoint
 from palpate_recorder.recover import recover
-from palpate_tissue.backends.fmu.mapping import load_map
+from palpate_tissue.backends.fmu.wiring import load_map
 
 TOPIC = "joint_states"
 
@@ -242,9 +242,8 @@ def _foreign(path: Path, *, table: bool) -> None:
 
 
 def _checkpoint(stored: bool) -> bytes:
-    names = FeltSoFar.__dataclass_fields__
-    rows: dict[str, Any] = {name: np.zeros((2, 3) if name in ("position", "normal", "velocity") else 2) for name in names}
-    made = Checkpoint(FeltSoFar(**rows), np.zeros((1, 2)), np.zeros((3, 3)), 1)
+    rows: dict[str, Any] = {name: np.zeros((2, 3) if name in ("position", "normal", "velocity") else 2) for name in FELT}
+    made = Checkpoint(rows, np.zeros((1, 2)), np.zeros((3, 3)), 1)
     if not stored:
         return made.bytes()
     file = io.BytesIO()

@@ -27,10 +27,9 @@ from palpate_planning.interruptions import WALL
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.coverage import Stroke, strokes, transfer
 from palpate_planning.strokes.path import SurfacePath, frames_along
-from palpate_planning.strokes.segments import Segment
-from palpate_planning.wall.breath import Breath
+from palpate_planning.strokes.plan import Segment
 from palpate_planning.wall.surface import Foot, PerceivedSurface
-from palpate_planning.wall.wall import Wall, WallEstimate
+from palpate_planning.wall.wall import Breath, Wall, WallEstimate
 
 _DENSE_M: Final = 0.0003
 """Spacing of the places of a path: about the travel of the indenter in a period."""

@@ -15,10 +15,10 @@ from scipy.spatial import Delaunay
 from scipy.special import k0, k1
 
 from palpate_models.numerics.frames import Array
+from palpate_models.patient.healthy import pressed_force
 from palpate_models.patient.person import draw_person
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom, Stiffness
-from palpate_models.patient.tension import pressed_force
 from palpate_models.scenario.press import DEPTH_M
 
 PITCH_M: Final = 0.004

@@ -7,11 +7,10 @@ import numpy as np
 
 from palpate.exam_state import exam_state
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
-from palpate_assessment.assess import assess
-from palpate_assessment.grid import map_grid
-from palpate_assessment.places import places_of
+from palpate_assessment.assess import assess, map_grid
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
+from palpate_assessment.standard import places_of
 from palpate_bus.messages import NS, ExamState, header
 from palpate_bus.messages.geometry import mesh_message
 from palpate_conductor.collector import Collected

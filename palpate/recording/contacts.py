@@ -26,8 +26,7 @@ from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Fault, FaultCode, Palpated, Remedy, is_refused, width
 from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array, apply, inverse, path_length
-from palpate_models.patient.mesh import vertex_normals
-from palpate_models.patient.mesh_file import read_mesh
+from palpate_models.patient.mesh import read_mesh, vertex_normals
 
 _TRAVEL: Final = (0.005, 4.0)
 """Plausible travel of a contact along the normal, in radii of the tool."""

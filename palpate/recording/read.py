@@ -26,7 +26,7 @@ from palpate.recording.recording import (
     width,
 )
 from palpate.report.evidence import FILE, columns_of, points, read_evidence, xyz
-from palpate_assessment.calibration import load_calibration
+from palpate_assessment.standard import load_calibration
 from palpate_bus.messages import NS, nanoseconds
 from palpate_models.numerics.frames import Array, Mask, apply, inverse, matrix
 from palpate_models.scenario.load import exam_input, load_scenario

@@ -121,7 +121,7 @@ class Resumption(NamedTuple):
     def summary(self) -> str:
         """Text for the user: the run, its samples, its remaining targets."""
         left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
-        return "; ".join((f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples{left}", *self.damage))
+        return "; ".join((f"continuing {self.folder.parent}: {len(self.checkpoint.felt['time'])} samples{left}", *self.damage))
 
 
 def resumption(folder: Path) -> Resumption:
@@ -139,7 +139,7 @@ def resumption(folder: Path) -> Resumption:
         moved = "the patient moved during the examination, so its samples do not fit a new scan"
         raise evidence.EvidenceError(f"--resume {folder}: {moved}; start a new run")
     reached = _last_checkpoint(runs)
-    if not len(reached.felt.time):
+    if not len(reached.felt["time"]):
         raise evidence.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
         raise evidence.EvidenceError(f"--resume {folder}: all targets were reached; see palpate report {folder} --recover")

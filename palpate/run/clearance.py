@@ -11,9 +11,8 @@ from palpate_models.robot.arm import arm_of
 from palpate_models.robot.fitting import ready_postures
 from palpate_models.robot.table import boxes
 from palpate_models.robot.urdf_arm import home_advice
-from palpate_models.scenario.arm_file import DEFAULT_ARM
 from palpate_models.scenario.load import exam_input, true_pose
-from palpate_models.scenario.schema import Limits, Robot, Scenario
+from palpate_models.scenario.schema import DEFAULT_ARM, Limits, Robot, Scenario
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.placement.redundancy import Batch, PostureSequence, plan_redundancy

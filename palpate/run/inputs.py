@@ -15,12 +15,11 @@ from palpate_bus.settings import Settings
 from palpate_conductor.collector import EXAM_LIMIT
 from palpate_errors import UserError, restate
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.mesh_file import MeshError
+from palpate_models.patient.mesh import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
-from palpate_models.scenario.arm_file import DEFAULT_ARM
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.patterns import Scan, Surface, scan_of, touch_centres
-from palpate_models.scenario.schema import PATTERN, Exam, Mode, Scenario
+from palpate_models.scenario.schema import DEFAULT_ARM, PATTERN, Exam, Mode, Scenario
 from palpate_plugins import PluginError, is_file
 
 

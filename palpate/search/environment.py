@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from palpate.search.trial import PatientHand, SearchCase, SurrogateHand, case
 from palpate_models.numerics.frames import Array
-from palpate_search.posterior import LAYERS, Posterior, maps, shape
-from palpate_search.presses import Budget, Task, press_duration
+from palpate_search.posterior import LAYERS, Budget, Posterior, Task, maps, press_duration, shape
 
 ID: Final = "Palpate/Search-v0"
 REWARD_PER_S: Final = 0.01

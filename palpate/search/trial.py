@@ -16,13 +16,12 @@ from palpate.quick.examination import QuickExamination
 from palpate.quick.felt import FeltPatient, between, felt_patient
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.numerics.seeds import generator
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_planning.stroke import STROKE
-from palpate_search.posterior import Policy, Posterior
-from palpate_search.presses import Press, Task, press_duration
+from palpate_search.posterior import Policy, Posterior, Press, Task, press_duration
 
 TARE_N: Final = 0.05
 """SD of the force after taring."""

@@ -19,7 +19,7 @@ from palpate.run.roles import check_choices
 from palpate.study.shift import Family, shift_patient
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
 from palpate_errors import UserError
-from palpate_models.patient.mesh_file import MeshError
+from palpate_models.patient.mesh import MeshError
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.errors import Errors
 from palpate_models.scenario.load import as_settings, load_scenario

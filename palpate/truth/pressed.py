@@ -23,10 +23,9 @@ from scipy.spatial import Delaunay, cKDTree
 import palpate_models
 from palpate_models.numerics.cache import content_key, remember
 from palpate_models.numerics.frames import Array, Mask
-from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
 from palpate_models.patient.mesh import vertex_normals
-from palpate_models.patient.motion import Motion
+from palpate_models.patient.motion import Breathing, Motion
 from palpate_models.patient.schema import Lesion, Structure
 from palpate_models.scenario.schema import Exam, Scenario
 

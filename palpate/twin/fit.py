@@ -33,8 +33,7 @@ from palpate_assessment.sampling import ForceSample
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.patient.field import lesion_field
-from palpate_models.patient.grid import BodyGrid
-from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.patient.phantom import BodyGrid, PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario

@@ -11,8 +11,7 @@ from matplotlib.animation import PillowWriter
 from palpate.interface.scenarios import scenario
 from palpate.search.trial import PatientHand, search
 from palpate_models.numerics.frames import Array
-from palpate_search.posterior import Posterior, policy
-from palpate_search.presses import Budget
+from palpate_search.posterior import Budget, Posterior, policy
 
 
 def main(

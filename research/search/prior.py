@@ -13,9 +13,8 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from palpate.search.trial import SurrogateHand, case, search
-from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import field_covariances
-from palpate_assessment.standard import LENGTHS, USUAL
+from palpate_assessment.standard import LENGTHS, USUAL, load_calibration
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.posterior import Posterior, policy

@@ -17,7 +17,7 @@ STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 MAY_KNOW_THE_PHANTOM = {"tissue"}
 SHARED_VALUES = {"palpate_bus.messages.codes", "palpate_bus.setpoint"}
 """Codes that messages carry, and the arrays that planning makes and control follows, with their conversion to a message."""
-MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py"}
+MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "moving.py", "stop_requests.py"}
 NOT_IN_A_STEP = {
     "zenoh", "socket", "threading", "asyncio", "multiprocessing", "subprocess", "time", "datetime", "random", "secrets", "uuid",
 }  # fmt: skip
@@ -108,7 +108,7 @@ DATA_AND_DRIVERS = (
     "models/palpate_models/robot/visual.py",
     "services/robot/palpate_robot/backends/",
 )
-ONE_LINE = {"models/palpate_models/scenario/arm_file.py": 1, "models/palpate_models/robot/arm.py": 1}
+ONE_LINE = {"models/palpate_models/scenario/schema.py": 1, "models/palpate_models/robot/arm.py": 1}
 """The default, and where its tables are read."""
 
 

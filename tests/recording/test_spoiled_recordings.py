@@ -13,7 +13,7 @@ from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Ma
 from palpate.recording.read import recording_of
 from palpate.recording.readings import Readings, from_table
 from palpate.recording.recording import FaultCode, PalpationRecording
-from palpate_assessment.places import places_of
+from palpate_assessment.standard import places_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))

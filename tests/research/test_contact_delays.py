@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import FEATURES
+from palpate_assessment.standard import load_calibration
 from palpate_bus.messages import MS
 from palpate_bus.testing import HandInbox
 from palpate_models.patient.schema import Build

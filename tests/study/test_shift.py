@@ -10,8 +10,8 @@ from palpate.study.cases import Request, cases_of, patient_seeds
 from palpate.study.shift import FAMILIES, Family, shift_patient
 from palpate.study.spec import StudyError, load_study
 from palpate_models.patient.abdomen import bone_share
-from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.field import edge_distance, structure_at_skin
+from palpate_models.patient.motion import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.errors import ChosenErrors, Errors, draw_errors
 from palpate_models.scenario.load import as_settings, load_scenario

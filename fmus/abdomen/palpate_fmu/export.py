@@ -28,8 +28,8 @@ from palpate_fmu.variables import (
     variables,
 )
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.field import at_skin
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.person import draw_person
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom

@@ -6,7 +6,7 @@ import pytest
 
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
-from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.motion import Breathing
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_models.patient.wall import Guarding
 

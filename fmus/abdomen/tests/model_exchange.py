@@ -12,7 +12,7 @@ from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
 
 from palpate_fmu.reading import read_variables
-from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.motion import Breathing
 from palpate_models.patient.schema import Lesion, Phantom
 
 Array = np.ndarray

@@ -17,7 +17,7 @@ from palpate_fmu.instance import FmuInstance
 from palpate_fmu.probing import COLUMNS, probe
 from palpate_fmu.reading import FmuError
 from palpate_fmu.variables import TABLE, Sizes, VariableKind
-from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.motion import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Phantom
 

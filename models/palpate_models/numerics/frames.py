@@ -12,6 +12,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Ints = NDArray[np.int64]
+Array32 = NDArray[np.float32]
+Ints32 = NDArray[np.int32]
+Unsigned = NDArray[np.uint32]
 
 
 def frozen(values: ArrayLike) -> Array:

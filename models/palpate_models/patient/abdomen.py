@@ -4,10 +4,9 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from palpate_models.numerics.frames import Array, Indices, Mask
+from palpate_models.numerics.frames import Array, Indices, Ints32, Mask
 from palpate_models.patient.field import smoothstep
 from palpate_models.patient.mesh import orient, vertex_normals
 from palpate_models.patient.schema import Anatomy, Skeleton
@@ -63,7 +62,7 @@ class Shape(NamedTuple):
     """A closed surface in A: vertices (n, 3) [m], triangles (m, 3), outward normals (n, 3), fixed vertices (n,)."""
 
     vertices: Array
-    triangles: NDArray[np.int32]
+    triangles: Ints32
     normals: Array
     fixed: Mask
 
@@ -146,7 +145,7 @@ def _grade(half: float, other_distance: float, inner: float, edge: float) -> Arr
     return np.interp(np.linspace(0, count[-1], max(3, round(count[-1]) + 1)), count, x)
 
 
-def _strip(left: Indices, right: Indices) -> NDArray[np.int32]:
+def _strip(left: Indices, right: Indices) -> Ints32:
     """Triangles between two chains of as many vertices; chains may share their first vertex."""
     quads = np.column_stack((left[:-1], right[:-1], right[1:], left[1:]))
     triangles = np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
@@ -169,7 +168,7 @@ def _plan(body: _Body, edge: float) -> tuple[Array, int]:
     return np.concatenate((inside, *border)), len(inside)
 
 
-def _close(plan: Array, inner: int, outer: tuple[float, float]) -> NDArray[np.int32]:
+def _close(plan: Array, inner: int, outer: tuple[float, float]) -> Ints32:
     """Triangles of both ends and of the back, shape (k, 3)."""
     index = np.arange(inner, len(plan))
     s, y = plan[inner:].T

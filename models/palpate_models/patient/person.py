@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient import schema
-from palpate_models.patient.breathing import Breathing
+from palpate_models.patient.motion import Breathing
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.wall import Guarding
 

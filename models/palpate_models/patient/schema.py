@@ -8,8 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from palpate_models.patient.breathing import Breathing
-from palpate_models.patient.motion import Motion
+from palpate_models.patient.motion import Breathing, Motion
 from palpate_models.patient.wall import MEDIAN, Guarding
 from palpate_models.section import Ends, Length, NonNegative, Positive, Section, Vec2
 
@@ -224,7 +223,7 @@ class Phantom(Section):
     mesh: str | None = None
     """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
     grid: str | None = None
-    """CSV file of `palpate_models.patient.grid` (kind: grid), relative to the scenario's file. It replaces `background` and, of
+    """CSV file of `patient.phantom` (kind: grid), relative to the scenario's file. It replaces `background` and, of
     `stiffness`, `k_w_n_per_m3` and `stiffening_per_m`."""
     size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
     """Width, length and height of the parametric abdomen; of `kind: grid`, the height is the thickness of the elastic tier."""

@@ -23,8 +23,7 @@ from palpate_inputs import MB, bounds, over, read_text
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_postures
-from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
-from palpate_models.scenario.schema import Limits
+from palpate_models.scenario.schema import ArmFile, Limits, arm_file, arm_path
 
 
 class UrdfTree:

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Ints32
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import TOOL, arm_of
 from palpate_models.robot.chain import Arm, Capsule
@@ -29,13 +28,11 @@ class VisualMesh(NamedTuple):
     """A mesh in its link's frame: vertices [m], shape (n, 3); outward triangles, shape (m, 3); colour, each in 0..1."""
 
     vertices: Array
-    triangles: NDArray[np.int32]
+    triangles: Ints32
     rgba: Rgba
 
 
-def revolve(
-    profile: Array, axis: Sequence[float] = (0, 0, 1), origin: Sequence[float] = (0, 0, 0)
-) -> tuple[Array, NDArray[np.int32]]:
+def revolve(profile: Array, axis: Sequence[float] = (0, 0, 1), origin: Sequence[float] = (0, 0, 0)) -> tuple[Array, Ints32]:
     """Return a profile of (radius, height) rows, from the low end of the axis to its high end, turned about `axis`.
 
     Closed where the profile begins and ends on the axis (radius 0). Vertices [m], shape (n, 3), and outward triangles.
@@ -102,7 +99,7 @@ def _capsules(arm: Arm) -> dict[str, list[VisualMesh]]:
     return {link: [VisualMesh(*_capsule(capsule), WHITE) for capsule in capsules] for link, capsules in shapes if capsules}
 
 
-def _capsule(capsule: Capsule) -> tuple[Array, NDArray[np.int32]]:
+def _capsule(capsule: Capsule) -> tuple[Array, Ints32]:
     start, end = np.array(capsule.start), np.array(capsule.end)
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / length if length else (0.0, 0.0, 1.0)

@@ -1,55 +1,35 @@
 """Checkpoint of an interrupted examination: its measurements, for the run that resumes it."""
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from palpate_errors import UserError, restate
 from palpate_inputs import read_arrays
-from palpate_models.numerics.frames import Array, Ints, Mask
+from palpate_models.numerics.frames import Array
 
 
 class CheckpointError(UserError):
     """A checkpoint that cannot be used. Names the file and what is wrong."""
 
 
-@dataclass(frozen=True)
-class FeltSoFar:
-    """Samples of the assessment, m of them, in the abdomen frame A."""
-
-    time: Array
-    """[s], shape (m,); negative: before the resumed run."""
-    position: Array
-    """[m], shape (m, 3)."""
-    normal: Array
-    """Outward, shape (m, 3)."""
-    velocity: Array
-    """Tangential [m/s], shape (m, 3)."""
-    depth: Array
-    """[m]"""
-    force: Array
-    """[N]"""
-    force_noise: Array
-    """Standard error of the force [N]."""
-    time_in_contact: Array
-    """[s]"""
-    force_limited: Mask
-    """Depth was reduced by the force limit."""
-    stroke: Ints
-    """Number of the descent."""
-    depth_uncertainty: Array
-    """One sigma of the depth [m]."""
-    exponent: Array
-    """Force exponent of the descent to a held press [1]; 0 for other samples."""
+FELT = (
+    *("time", "position", "normal", "velocity", "depth", "force", "force_noise", "time_in_contact", "force_limited", "stroke"),
+    *("depth_uncertainty", "exponent"),
+)
+"""Columns of the samples: the fields of `ForceSample` of the assessment."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
     """State of an examination at its interruption."""
 
-    felt: FeltSoFar
+    felt: Mapping[str, Any]
+    """Columns `FELT` of m samples, in A, shape (m,) or (m, 3). Their times [s] are negative: before the resumed run."""
     left: Array
     """Targets that were not reached, in A [m], shape (k, 2)."""
     surface: Array
@@ -65,7 +45,7 @@ class Checkpoint:
     def bytes(self) -> bytes:
         """Return the content of the file."""
         file = io.BytesIO()
-        np.savez_compressed(file, left=self.left, surface=self.surface, strokes=np.array(self.strokes), **vars(self.felt))
+        np.savez_compressed(file, left=self.left, surface=self.surface, strokes=np.array(self.strokes), **self.felt)
         return file.getvalue()
 
 
@@ -76,6 +56,8 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
     held = dict(read_arrays(path, path, CheckpointError))
     with restate((ValueError, KeyError, TypeError), CheckpointError, f"{path}: not a checkpoint of this version"):
         left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
+        if held.keys() != set(FELT):
+            raise ValueError(f"samples of {', '.join(held)}; expected {', '.join(FELT)}")
         rows = len(held["time"])
         wanted: dict[str, tuple[int, ...]] = {
             name: (rows, 3) if name in ("position", "normal", "velocity") else (rows,) for name in held
@@ -84,4 +66,4 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
         for name, array in {**held, "left": left, "surface": surface, "strokes": strokes}.items():
             if array.shape != wanted[name] or array.dtype.kind not in "bif" or not np.isfinite(array).all():
                 raise ValueError(f"{name}: expected finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
-        return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
+        return Checkpoint(held, left, surface, int(strokes))

@@ -12,7 +12,7 @@ from palpate_bus.messages.stamps import MS, duration_message, header, nanosecond
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose
 from palpate_models.robot.chain import Arm
-from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.schema import CommandLevel
 
 COMMAND = "control/joint_torque"
 VALID = contract().topics["planning/setpoint"].expiry

@@ -11,9 +11,8 @@ from palpate.exam_state import exam_state
 from palpate_bus.messages import MS, NS, ExamState, OperatorRequest, RobotStatus, SupervisorState, header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
 from palpate_models.robot.arm import arm_of, tool_jacobian, tool_pose, urdf
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Limits
+from palpate_models.scenario.schema import CommandLevel, Limits
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
 FORCE_ERROR_N: Final = 3.0

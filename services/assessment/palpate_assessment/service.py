@@ -7,11 +7,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_assessment.assess import AssessedMap, assess, assess_growing
-from palpate_assessment.findings import Area
-from palpate_assessment.grid import MapGrid, map_grid
-from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
-from palpate_assessment.seen_breath import SeenBreath
+from palpate_assessment.assess import Area, AssessedMap, MapGrid, assess, assess_growing, map_grid
+from palpate_assessment.sampling import ContactState, ForceSample, Sampler, SeenBreath, samples_of
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import MessageViolation, RefusedMessage, ViolationKind
@@ -341,6 +338,7 @@ def findings_message(t: int, findings: Sequence[Area], candidates: Sequence[Area
 def finding_message(area: Area) -> Message:
     """`palpation_msgs/Finding`."""
     x, y, z = map(float, area.centroid)
+    lump, muscle, ridge, bone, soft = area.kinds.tolist()
     return Finding(
         centroid=Point(x, y, z),
         quadrant=quadrant(x, y),
@@ -348,10 +346,10 @@ def finding_message(area: Area) -> Message:
         ratio=area.ratio,
         ratio_lower=area.ratio_lower,
         ratio_upper=area.ratio_upper,
-        confidence=area.confidence,
-        guarding=area.guarding,
-        ridge=area.ridge,
-        bone=area.bone,
-        soft=area.soft,
-        kind=area.kind,
+        confidence=lump,
+        guarding=muscle,
+        ridge=ridge,
+        bone=bone,
+        soft=soft,
+        kind=int(area.kinds.argmax()),
     )

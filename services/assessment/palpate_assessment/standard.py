@@ -1,23 +1,147 @@
-"""The standard press and the priors of a stiffness map.
+"""The standard press and the priors of a stiffness map, the skin through its samples, and the fitted constants.
 
 A press averages over the radius of its footprint, sqrt(2 R d - d^2) for a sphere of radius R at depth d, so all lengths scale
-with it. Forces scale with the force of the press.
+with it. Forces scale with the force of the press. `calibration.yaml` is made by `python -m research.assessment_calibration`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.resources import files
 from math import sqrt
-from typing import Any, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay, cKDTree
 from scipy.special import expit
 
-from palpate_assessment.calibration import Calibration, load_calibration
-from palpate_assessment.places import SampledPlaces, places_of
 from palpate_assessment.sampling import ForceSample
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario import press
+
+_GAP: Final = 2.0
+"""Maximum circumradius of a triangle of samples without a gap, over their usual distance."""
+
+_NEIGHBOURS: Final = 9
+"""Samples, itself among them, whose median is the height of the skin at a place."""
+
+
+@dataclass(frozen=True)
+class SampledPlaces:
+    """Places of samples; m of them, not all on one line."""
+
+    xy: Array
+    """[m], shape (m, 2)."""
+    z: Array
+    """Height of the skin there [m], shape (m,)."""
+
+    @cached_property
+    def mesh(self) -> Delaunay:
+        """Triangles between the places."""
+        return Delaunay(self.xy)
+
+    @cached_property
+    def circumradii(self) -> Array:
+        """Circumradii of the triangles [m], shape (t,)."""
+        sides = [self.xy[self.mesh.simplices[:, k]] - self.xy[self.mesh.simplices[:, k - 1]] for k in range(3)]
+        doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
+        return np.asarray(np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30))
+
+    @cached_property
+    def spacing(self) -> float:
+        """Usual distance of neighbours [m]: in a raster its pitch, in lines about that of one from the next."""
+        whole = (self.mesh.neighbors >= 0).all(axis=1)  # those along the border may be slivers
+        return float(np.sqrt(2) * np.median(self.circumradii[whole if whole.any() else slice(None)]))
+
+    @cached_property
+    def filled(self) -> Mask:
+        """True for triangles without a gap of many samples, as in a notch of the region, shape (t,)."""
+        return np.asarray(self.circumradii <= _GAP * self.spacing)
+
+    def encloses(self, places: Array) -> Mask:
+        """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
+        inside = self.mesh.find_simplex(places)
+        return np.asarray((inside >= 0) & self.filled[inside])
+
+    def lift(self, places: Array) -> Array:
+        """Return places [m] on the skin through the samples, shape (k, 2) -> (k, 3); outside it is as high as the nearest one."""
+        height = np.asarray(self._height(places))
+        outside = np.isnan(height)
+        height[outside] = self.z[cKDTree(self.xy).query(places[outside])[1]]
+        return np.column_stack((places, height))
+
+    @cached_property
+    def _height(self) -> LinearNDInterpolator:
+        return LinearNDInterpolator(self.mesh, self.z)
+
+
+def places_of(samples: Sequence[ForceSample]) -> SampledPlaces:
+    """Return the places of samples; each is as high as its neighbours, for an error of its own depth is not the body's shape."""
+    position = np.array([sample.position for sample in samples])
+    near = cKDTree(position[:, :2]).query(position[:, :2], min(_NEIGHBOURS, len(position)))[1].reshape(len(position), -1)
+    return SampledPlaces(position[:, :2], np.median(position[near, 2], axis=1))
+
+
+class Calibration(BaseModel):
+    """Constants of the regression, and of a candidate's probability."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    exponent: float
+    """n of F ~ depth^n around the examination's depth."""
+    exponent_sd: float
+    """Its SD between people."""
+    conversion: float
+    """Log of the ratio of sliding force at the depth of the press to the force of the press."""
+    conversion_sd: float
+    """Its SD between people, tissues, speeds and indenters; presses held before slides determine the patient's own."""
+    held: float
+    """Log of the ratio of held presses to the standard press, against the slides near them: beyond their wake, too, slides are
+    a little weaker than elsewhere."""
+    lead_s: float
+    """A sliding indenter feels this much of its travel ahead [s]."""
+    probability: tuple[float, ...]
+    """Weights of a candidate's features (`detection.FEATURES`) in the logit of its probability, the constant first."""
+    guarding: tuple[float, float, float]
+    """Weights of the signs of a tensed muscle (`guarding.Signs`) in its log odds against everything except a lump, the constant
+    first."""
+    ridge: tuple[float, float, float, float]
+    """Weights of the evidence for a ridge (`Candidate.structures`) in its log odds against a lump, the constant first."""
+    bone: tuple[float, float, float, float, float]
+    """Weights of the evidence for bone in its log odds against a lump, the constant first."""
+    soft: tuple[float, float, float, float]
+    """Weights of the evidence for a soft defect in its log odds against a lump, the constant first."""
+    prevalence: float
+    """Share of the patients of the fit who have a lump that can be felt."""
+    tail: tuple[float, float]
+    """Location and scale of a healthy examination's maximum logit: P(max > s) = exp(-(s - location) / scale)."""
+
+    def logit(self, features: Array) -> Array:
+        """Logits of the probability of candidates with `features`, shape (k, f) -> (k,)."""
+        return np.asarray(self.probability[0] + features @ np.array(self.probability[1:]))
+
+    def muscle(self, features: Array) -> Array:
+        """The logarithm of how much more probable a tensed muscle is than nothing, of signs' `features`, shape (k, 2) -> (k,)."""
+        return np.asarray(self.guarding[0] + features @ np.array(self.guarding[1:]))
+
+    def structures(self, evidence: Array) -> Array:
+        """Logs of how much more probable a ridge, bone and a soft defect are than a lump, of `evidence` (k, 10) -> (k, 3)."""
+        parts = ((self.ridge, evidence[:, :3]), (self.bone, evidence[:, 3:7]), (self.soft, evidence[:, 7:]))
+        return np.column_stack([weights[0] + of @ np.array(weights[1:]) for weights, of in parts])
+
+    def threshold(self, false_findings: float) -> float:
+        """Return the logit that a healthy examination exceeds with the probability `false_findings`."""
+        location, scale = self.tail
+        return float(location - scale * np.log(false_findings))
+
+
+@cache
+def load_calibration() -> Calibration:
+    """Return the calibration of this version."""
+    return Calibration.model_validate(yaml.safe_load(files(__package__).joinpath("calibration.yaml").read_text("utf-8")))
 
 
 class AnatomyPrior(NamedTuple):

@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 from assessment_lines import LEVEL, UP, flat_grid, level, lines, lump, natural, observations, regression
 
-from palpate_assessment.assess import AssessedMap, assess, assess_growing
-from palpate_assessment.calibration import load_calibration
-from palpate_assessment.detection import Candidate, Signs, limit_strength, signs
-from palpate_assessment.findings import causes, marked_share
-from palpate_assessment.grid import map_grid
+from palpate_assessment.assess import AssessedMap, assess, assess_growing, causes, map_grid, marked_share
+from palpate_assessment.detection import Candidate, Signs, find_disc, limit_strength, match_bumps, signs
 from palpate_assessment.model import Regression, fit_log_amplitudes
 from palpate_assessment.observations import Observations
 from palpate_assessment.sampling import ForceSample
-from palpate_assessment.shape_search import find_disc, match_bumps
 from palpate_assessment.shapes import Bump, ridge
-from palpate_assessment.standard import LENGTHS, PressStandard
+from palpate_assessment.standard import LENGTHS, PressStandard, load_calibration
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.codes import FindingKind
 from palpate_models.scenario.schema import Marked

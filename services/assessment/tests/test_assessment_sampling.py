@@ -10,9 +10,8 @@ import pytest
 from palpate.report.evidence import map_of
 from palpate.report.rows import finding_rows
 from palpate.report.scoring import Truth, score
-from palpate_assessment.grid import map_grid
-from palpate_assessment.sampling import TRAVEL, ContactState, ForceSample, Sampler
-from palpate_assessment.seen_breath import SeenBreath, depth_seen
+from palpate_assessment.assess import map_grid
+from palpate_assessment.sampling import TRAVEL, ContactState, ForceSample, Sampler, SeenBreath, depth_seen
 from palpate_assessment.service import MAP, AssessmentService, create, skin_of
 from palpate_bus.messages import (
     NS,

@@ -21,8 +21,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera.backends.replay import POSE, ReplayedCamera
 from palpate_camera.backends.ros import CameraPort, RosCameraService
-from palpate_camera.inputs import CameraError
-from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, CameraError
 from palpate_errors import UserError
 from palpate_models.scenario.schema import RosCamera
 from palpate_recorder.service import RecorderService

@@ -19,12 +19,11 @@ from palpate_bus.runtime.observer import ObservedService
 from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
-from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import GRANTS, Grants
 from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, incomplete, unsampled
-from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
+from palpate_conductor.watchdog import ContractWatch, FreezeWatch, Heartbeat, RunWatchdog, service_statuses
 from palpate_inputs import InputError, parse_json
 from palpate_models.scenario.schema import ExamInput
 

@@ -105,9 +105,18 @@ class ImpedanceController:
     """The control law with its safety net. One instance per arm: the rate limit needs the previous torque."""
 
     def __init__(self, model: ArmModel, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
-        """Create a controller called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
+        """Create a controller called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad] (0: none).
+
+        The repulsion is a progressive spring before each joint limit: conservative, and smooth at the edge of the zone.
+        """
         self.model = model
-        self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
+        lower, upper, limit = model.position_lower, model.position_upper, model.torque_limit
+        gain = REPULSION_FRACTION * limit / limit_zone**2 if limit_zone > 0 else np.zeros_like(lower)
+        self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - limit_zone, gain, limit))
+        self.peak = np.zeros_like(limit)
+        """Largest magnitude of each torque so far [N m], shape (n,)."""
+        self._rate = TORQUE_RATE_NM_PER_MS * period_s / 1e-3
+        self._last = np.zeros_like(limit)
         self._dead_time = TUNING.dead_ticks * period_s
         self._friction = np.stack((model.viscous_friction, model.coulomb_friction, model.velocity_limit))
         self._designed_for: Setpoint | None = None
@@ -115,25 +124,23 @@ class ImpedanceController:
         self._cartesian_gains: CartesianGains  # designed in the first tick, as the joint gains
         self._joint_gains: JointGains
 
-    @property
-    def peak(self) -> Array:
-        """Largest magnitude of each torque so far [N m], shape (n,)."""
-        return self._net.peak
-
     def reset(self) -> None:
         """Restart the rate limit from zero torque, after a pause without commands."""
-        self._net.reset()
+        self._last = np.zeros_like(self._last)
         self._designed_for = None
 
     def command(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Return the torque command without gravity [N m], shape (n,), at positions `q` [rad] and velocities `qd` [rad/s]."""
         q, qd = np.array(q, dtype=float), np.array(qd, dtype=float)
         law = self._cartesian if reference.setpoint.mode is ControlMode.CARTESIAN else self._joint
-        return self._net.torque(law(q, qd, reference), q, self.model.gravity)
+        wanted, torque = law(q, qd, reference), np.empty(len(q))
+        safe_torque(wanted, q, self.model.gravity, self._last, self._rate, self._joints, self.peak, torque)
+        self._last = torque
+        return torque
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Return the unlimited torque of mode CARTESIAN [N m], shape (n,)."""
-        model, (R_WD, x) = self.model, reference.motion
+        model, R_WD, x = self.model, reference.motion.R_WD, reference.motion.x
         model.update(q, qd)
         if self._design_due(reference.setpoint):
             setpoint = reference.setpoint  # copied: arrays of messages are read-only, a different type for numba
@@ -268,39 +275,6 @@ def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: 
     damping = 2 * LAW.joint_damping_ratio * np.sqrt(squared)
     damping = np.maximum(damping - friction, LAW.min_damping * damping)
     return JointGains((modes * squared) @ modes.T, (modes * damping) @ modes.T)
-
-
-class SafetyNet:
-    """Adds repulsion from joint limits and limits torque and torque rate.
-
-    The repulsion is a progressive spring in the last `zone` before each joint limit: conservative, and smooth at the edge of the
-    zone. Saturation includes gravity. The change from tick to tick is bounded.
-    """
-
-    def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float) -> None:
-        """Take joint limits [rad] and torque limits [N m], shapes (n,); `zone` [rad] (0: no repulsion); one torque per
-        `period_s`.
-        """
-        gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
-        self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit))
-        self.peak = np.zeros_like(torque_limit)
-        """Largest magnitude of each torque so far [N m], shape (n,)."""
-        self._rate = TORQUE_RATE_NM_PER_MS * period_s / 1e-3
-        self._last = np.zeros_like(torque_limit)
-
-    def reset(self) -> None:
-        """Restart from zero torque, as after a pause without commands."""
-        self._last = np.zeros_like(self._last)
-
-    def torque(self, wanted: Array, q: Array, gravity: Array) -> Array:
-        """Return the torque to command instead of `wanted` [N m], shape (n,), at joint positions `q` [rad].
-
-        The torque, and the torque plus `gravity`, are within limits.
-        """
-        safe = np.empty(len(q))
-        safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, self.peak, safe)
-        self._last = safe
-        return safe
 
 
 @compiled

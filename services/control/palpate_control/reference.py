@@ -36,46 +36,23 @@ _POSE = slice(0, 6)
 
 
 class ReferenceMotion(NamedTuple):
-    """The moving part of a set-point at one time; the properties are those of `Setpoint`."""
+    """The moving part of a set-point at one time; the fields after `x` are views of it, as in `Setpoint`."""
 
     R_WD: Array
     x: Array
     """Coordinates, shape (18 + 3 n,)."""
+    p_WD: Array
+    V_WD: Array
+    F_W: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    """Acceleration of `q` [rad/s^2], shape (n,); zero in mode CARTESIAN."""
 
-    @property
-    def p_WD(self) -> Array:
-        """[m], shape (3,)."""
-        return self.x[POSITION]
-
-    @property
-    def V_WD(self) -> Array:
-        """[m/s] and [rad/s], shape (6,)."""
-        return self.x[TWIST]
-
-    @property
-    def F_W(self) -> Array:
-        """[N] and [N m], shape (6,)."""
-        return self.x[WRENCH]
-
-    @property
-    def q(self) -> Array:
-        """[rad], shape (n,)."""
-        return np.asarray(self._joints[0])
-
-    @property
-    def qd(self) -> Array:
-        """[rad/s], shape (n,)."""
-        return np.asarray(self._joints[1])
-
-    @property
-    def qdd(self) -> Array:
-        """Acceleration of `q` [rad/s^2], shape (n,); zero in mode CARTESIAN."""
-        return np.asarray(self._joints[2])
-
-    @property
-    def _joints(self) -> Array:
-        joints: Array = self.x[JOINTS:].reshape(3, -1)
-        return joints
+    @classmethod
+    def of(cls, R_WD: Array, x: Array) -> "ReferenceMotion":
+        """Return the motion with coordinates `x`, shape (18 + 3 n,)."""
+        return cls(R_WD, x, x[POSITION], x[TWIST], x[WRENCH], *x[JOINTS:].reshape(3, -1))
 
 
 class Reference(NamedTuple):
@@ -130,7 +107,7 @@ class Extrapolator:
             raise ValueError("no set-point received")
         self._tick = t
         x = self._coordinates(setpoint, t, t)
-        return Reference(setpoint, ReferenceMotion(pin.exp3(x[PHI]).dot(setpoint.R_WD), x), t)
+        return Reference(setpoint, ReferenceMotion.of(pin.exp3(x[PHI]).dot(setpoint.R_WD), x), t)
 
     def _coordinates(self, setpoint: Setpoint, t: int, faded: int) -> Array:
         """Return the coordinates at `t`, shape (18 + 3 n,), with the gap decayed until `faded` [ns]."""

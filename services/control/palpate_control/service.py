@@ -17,9 +17,8 @@ from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, urdf
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Limits, Robot, Scenario
+from palpate_models.scenario.schema import CommandLevel, Limits, Robot, Scenario
 
 
 class Problem(NamedTuple):

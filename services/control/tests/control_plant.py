@@ -76,4 +76,4 @@ def setpoint(arm: ArmModel, at: Any, stamp: int = 0, mode: ControlMode = Control
 
 def reference(setpoint_: Setpoint, t: int = 0) -> Reference:
     """Return a set-point as the law follows it at `t` [ns], without extrapolation."""
-    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros_like(setpoint_.q))), t)
+    return Reference(setpoint_, ReferenceMotion.of(setpoint_.R_WD, coordinates(setpoint_, np.zeros_like(setpoint_.q))), t)

@@ -12,8 +12,7 @@ from palpate_bus.testing import HandInbox
 from palpate_control import impedance
 from palpate_control.service import ControlService, create
 from palpate_models.robot.lbr import HOME, JOINT_NAMES
-from palpate_models.scenario.arm_file import CommandLevel
-from palpate_models.scenario.schema import Robot, Scenario
+from palpate_models.scenario.schema import CommandLevel, Robot, Scenario
 
 EXPIRY = 50 * MS
 

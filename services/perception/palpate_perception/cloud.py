@@ -13,12 +13,11 @@ excludes frames in which the pixel shows something behind an edge.
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
+from palpate_models.numerics.frames import Array, Array32, Indices, Mask, apply, inverse
 from palpate_models.scenario.schema import Exam
 
 
@@ -174,7 +173,7 @@ def find_supported(p: Array, xy: Array, spacing: float | Array) -> Mask:
     return np.isfinite(distance)
 
 
-Image = NDArray[np.float32]
+Image = Array32
 
 GATE: Final = 6.0
 """Half width of the gate, in standard deviations of a single frame."""

@@ -9,9 +9,8 @@ from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
 from palpate_perception.cloud import Cloud, DepthFusion, RegionBox, frame_sigma
-from palpate_perception.pipeline import PIPELINE
+from palpate_perception.pipeline import PIPELINE, Gaps
 from palpate_perception.surface import TUNING, fit
-from palpate_perception.visibility import Gaps
 
 SHAPE = (40, 50)
 WHOLE = (slice(0, SHAPE[0]), slice(0, SHAPE[1]))

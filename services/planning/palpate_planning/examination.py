@@ -15,19 +15,31 @@ from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactSensing
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, at_posture
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
-from palpate_planning.motion.planner import NoPathError
-from palpate_planning.motion.timing import RestartRamp
+from palpate_planning.motion.planner import NoPathError, RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
-from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, count_causes
+from palpate_planning.reasons import (
+    FAULTS,
+    FOR_FINDINGS,
+    FOR_JOINTS,
+    FOR_PERCEPTION,
+    FOR_PLAN,
+    FOR_ROBOT,
+    MOVED,
+    NO_CAUSE,
+    WAIT,
+    Cause,
+    StrokeWaits,
+    Tally,
+    count_causes,
+)
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures, nearest_targets
-from palpate_planning.waits import FOR_FINDINGS, FOR_JOINTS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT, StrokeWaits, Tally
 from palpate_planning.wall.wall import Wall, plane
 
 

@@ -16,13 +16,12 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.planner import NoPathError
-from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.motion.planner import JointTrajectory, NoPathError
 from palpate_planning.periods import MS, SECOND
+from palpate_planning.reasons import FOR_PLAN, WAIT
 from palpate_planning.setpoints import joint_setpoint
 from palpate_planning.stroke_motion import is_behind
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
-from palpate_planning.waits import FOR_PLAN, WAIT
 
 T = TypeVar("T")
 

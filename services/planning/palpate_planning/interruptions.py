@@ -12,14 +12,13 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, Mask
 from palpate_models.scenario.schema import Exam, Following, Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.motion.timing import JerkLimitedAxis
-from palpate_planning.reasons import MOVED, NO_CAUSE, Cause
+from palpate_planning.motion.planner import JerkLimitedAxis
+from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Tally
 from palpate_planning.stroke import Duration
 from palpate_planning.stroke_motion import MOTION
 from palpate_planning.strokes.path import PathPoint, centre
-from palpate_planning.strokes.segments import Segment
-from palpate_planning.waits import Tally
-from palpate_planning.wall.breath import Breath
+from palpate_planning.strokes.plan import Segment
+from palpate_planning.wall.wall import Breath
 
 
 class WallTuning(NamedTuple):

@@ -25,11 +25,10 @@ from palpate_models.scenario.schema import MOTION_NOTICED_S, ExamInput
 from palpate_planning import stroke
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
-from palpate_planning.reasons import Cause
+from palpate_planning.reasons import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_REQUEST, FOR_WALL, Cause, StrokeWaits, Tally, Wait
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import StrokeMotion
-from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_REQUEST, FOR_WALL, StrokeWaits, Tally, Wait
+from palpate_planning.strokes.plan import SEGMENTS, STRETCHED, Segment
 from palpate_planning.wall.wall import PublishedTouch, Wall
 
 

@@ -3,9 +3,8 @@
 from palpate_models.numerics.frames import Array
 from palpate_planning.free_motion import PLANNING_TIME, BackgroundTask
 from palpate_planning.palpation import Palpation
-from palpate_planning.strokes.requests import PressPlanner, PressRequest
-from palpate_planning.strokes.segments import Segment
-from palpate_planning.waits import FOR_PLAN
+from palpate_planning.reasons import FOR_PLAN
+from palpate_planning.strokes.plan import PressPlanner, PressRequest, Segment
 
 
 class RequestedPresses:

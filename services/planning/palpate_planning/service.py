@@ -39,11 +39,9 @@ from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.status import NO_STOP, ArmStop, ExamStatus, Observation
-from palpate_planning.strokes.plan import PerceivedAbdomen
-from palpate_planning.strokes.requests import PressRequest
-from palpate_planning.wall.breath import HIDDEN_M, BreathObservation
+from palpate_planning.strokes.plan import PerceivedAbdomen, PressRequest
 from palpate_planning.wall.surface import PerceivedSurface
-from palpate_planning.wall.wall import PublishedTouch
+from palpate_planning.wall.wall import HIDDEN_M, BreathObservation, PublishedTouch
 
 COINCIDENT_M = 1e-4
 """Consecutive targets closer than this have no path between them."""

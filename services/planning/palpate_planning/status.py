@@ -10,10 +10,8 @@ from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import AT_REST
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.strokes.plan import PerceivedAbdomen
-from palpate_planning.strokes.requests import PressRequest
-from palpate_planning.wall.breath import BreathObservation
-from palpate_planning.wall.wall import PublishedTouch
+from palpate_planning.strokes.plan import PerceivedAbdomen, PressRequest
+from palpate_planning.wall.wall import BreathObservation, PublishedTouch
 
 PHASE_OF: Final = {
     **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),

@@ -12,7 +12,7 @@ from palpate_bus.messages.codes import Reason
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.stroke_motion import MOTION, StrokeMotion
-from palpate_planning.strokes.segments import SEGMENTS
+from palpate_planning.strokes.plan import SEGMENTS
 from palpate_planning.wall.touch import FELT_N, Onset
 from palpate_planning.wall.wall import PublishedTouch
 

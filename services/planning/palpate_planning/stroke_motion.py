@@ -7,16 +7,15 @@ import numpy as np
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, tool_pose
-from palpate_models.scenario.arm_file import CommandLevel
-from palpate_models.scenario.schema import Exam, Limits, Robot
+from palpate_models.scenario.schema import CommandLevel, Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
-from palpate_planning.motion.timing import JerkLimitedAxis
+from palpate_planning.motion.planner import JerkLimitedAxis
 from palpate_planning.periods import SECOND
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
 from palpate_planning.strokes.path import LIMITS, PathPoint
-from palpate_planning.strokes.segments import SEGMENTS, Segment
+from palpate_planning.strokes.plan import SEGMENTS, Segment
 from palpate_planning.wall.wall import Wall
 
 

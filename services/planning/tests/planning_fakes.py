@@ -27,8 +27,8 @@ from palpate_planning.setpoints import CARTESIAN_STIFFNESS
 from palpate_planning.status import ArmStop, ExamStatus, ExamStep, Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
-from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
+from palpate_planning.wall.wall import FORECAST_STEP, BreathObservation
 
 PERIOD, FRAME = contract().roles["planning"].period, contract().roles["camera"].period
 RATES = contract().topics[TOPIC].rates

@@ -9,8 +9,7 @@ from palpate_models.robot.lbr import HOME, POSITION_LIMIT
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
-from palpate_planning.placement.redundancy import PostureSequence, plan_redundancy, prepare
-from palpate_planning.placement.symbolic import COST, arm, base_of
+from palpate_planning.placement.redundancy import COST, PostureSequence, arm, base_of, plan_redundancy, prepare
 
 ROBOT = Robot()
 

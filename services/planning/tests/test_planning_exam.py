@@ -15,7 +15,7 @@ from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
 from palpate_planning.reasons import Cause, Loss
-from palpate_planning.strokes.segments import STRETCHED
+from palpate_planning.strokes.plan import STRETCHED
 
 
 @pytest.fixture(scope="module")

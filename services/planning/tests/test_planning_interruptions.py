@@ -16,14 +16,13 @@ from palpate_models.robot import lbr
 from palpate_planning.contact import SensorReading
 from palpate_planning.interruptions import RECOVERY, Recovery
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.motion.planner import JointTrajectory
 from palpate_planning.palpation import NOT_TRACKED, Palpation
 from palpate_planning.periods import MS
-from palpate_planning.reasons import NO_CAUSE, Cause
+from palpate_planning.reasons import NO_CAUSE, Cause, Tally
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
 from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.waits import Tally
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]

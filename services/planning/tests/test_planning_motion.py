@@ -18,23 +18,28 @@ from palpate_models.numerics.frames import apply, inverse, rigid
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import tool_pose
 from palpate_models.robot.lbr import ARM, HOME
-from palpate_models.scenario.arm_file import arm_path
-from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot
+from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot, arm_path
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
-from palpate_planning.motion.planner import NoPathError, plan
+from palpate_planning.motion.planner import (
+    TIMING,
+    JerkLimitedAxis,
+    NoPathError,
+    RestartRamp,
+    SpeedLimit,
+    joint_trajectory,
+    plan,
+    round_corners,
+)
 from palpate_planning.motion.scene import CollisionScene
-from palpate_planning.motion.timing import TIMING, JerkLimitedAxis, RestartRamp, SpeedLimit, joint_trajectory, round_corners
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
-from palpate_planning.reasons import MOVED
+from palpate_planning.reasons import MOVED, WAIT, Tally
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import MOTION as STROKE_MOTION, StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath, centre, least_twist
-from palpate_planning.strokes.plan import ExamPlanner, look_postures
-from palpate_planning.strokes.segments import REACH, STRETCHED, Segment
-from palpate_planning.waits import WAIT, Tally
+from palpate_planning.strokes.plan import REACH, STRETCHED, ExamPlanner, Segment, look_postures
 from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import WallEstimate, plane
 

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.robot import lbr
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.patterns import LIMITS
-from palpate_models.scenario.schema import Mode, Robot
+from palpate_models.scenario.schema import CommandLevel, Mode, Robot
 from palpate_planning.motion.kinematics import IkSolution
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.reasons import Cause
@@ -20,7 +19,7 @@ from palpate_planning.stroke import StrokeInput, lift
 from palpate_planning.stroke_motion import StrokeMotion, stroke_setpoint
 from palpate_planning.strokes.coverage import TUNING, Stroke, strokes, touches
 from palpate_planning.strokes.path import SurfacePath, centre, frame, frames_along, least_twist
-from palpate_planning.strokes.segments import REACH, SEGMENTS, STRETCHED, Segment, SegmentPlanner
+from palpate_planning.strokes.plan import REACH, SEGMENTS, STRETCHED, Segment, SegmentPlanner
 from palpate_planning.wall.surface import PerceivedSurface
 from palpate_planning.wall.wall import plane
 

@@ -16,12 +16,22 @@ from palpate_planning.free_motion import BackgroundTask
 from palpate_planning.interruptions import WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
-from palpate_planning.reasons import NO_CAUSE, Cause
+from palpate_planning.reasons import (
+    FOR_ARM,
+    FOR_BREATH,
+    FOR_JOINTS,
+    FOR_PLAN,
+    FOR_WALL,
+    NO_CAUSE,
+    WAIT,
+    Cause,
+    StrokeWaits,
+    Tally,
+)
 from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.strokes.requests import PressRequest
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_JOINTS, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits, Tally
-from palpate_planning.wall.breath import Breath, BreathObservation
+from palpate_planning.strokes.plan import PressRequest
+from palpate_planning.wall.wall import Breath, BreathObservation
 
 
 def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> None:

@@ -16,14 +16,20 @@ from palpate_models.scenario.schema import Following
 from palpate_models.section import Pose
 from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
-from palpate_planning.reasons import Cause
+from palpate_planning.reasons import Cause, Tally
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen, nearest_targets
-from palpate_planning.waits import Tally
-from palpate_planning.wall.breath import FORECAST_STEP, TUNING as JOINING, Breath, BreathObservation
 from palpate_planning.wall.surface import BicubicField, CubicPieces, PerceivedSurface, bicubic_at, cubic_at
 from palpate_planning.wall.touch import FELT_N, TUNING, Onset, find_touch
-from palpate_planning.wall.wall import PRIOR, HeightMeasurement, TouchCorrection
+from palpate_planning.wall.wall import (
+    FORECAST_STEP,
+    PRIOR,
+    TUNING as JOINING,
+    Breath,
+    BreathObservation,
+    HeightMeasurement,
+    TouchCorrection,
+)
 
 X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))
 VERTICES, TRIANGLES = grid_mesh((0.14, 0.14))

@@ -13,9 +13,8 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.seeds import generators
 from palpate_models.robot.arm import arm_of, link_names, urdf
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
-from palpate_models.scenario.schema import PlantInput
+from palpate_models.scenario.schema import CommandLevel, PlantInput
 from palpate_robot.driver import TUNING, Driver
 from palpate_robot.plant import DT, PlantFactory
 from palpate_robot.position_loop import PositionLoop

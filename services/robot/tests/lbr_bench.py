@@ -9,9 +9,8 @@ from palpate_bus.messages import JointTorqueCommand, RobotStatus, duration_messa
 from palpate_bus.messages.geometry import vector
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.schema import CommandLevel, Scenario
 from palpate_robot.backends.arm_port import ArmPort
 from palpate_robot.backends.hardware import HardwareService, InnerLoop
 from palpate_robot.backends.lbr.emulator import Emulator

@@ -14,8 +14,8 @@ from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
 from palpate_robot.backends.hardware import GravityModel
-from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, MeasuredLbr
 from palpate_robot.backends.lbr.emulator import Emulator
+from palpate_robot.backends.lbr.port import CLOCK_SET_NS, MeasuredLbr
 
 
 @pytest.fixture

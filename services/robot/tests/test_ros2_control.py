@@ -17,8 +17,8 @@ from palpate_errors import UserError
 from palpate_models.robot.arm import arm_of, tool_pose
 from palpate_models.robot.chain import Arm
 from palpate_models.robot.urdf_arm import load_arm
-from palpate_models.scenario.arm_file import arm_path
 from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import arm_path
 from palpate_robot.backends.ros2_control.port import POSE, FlangePose, Ros2Port, StackStatus
 from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules

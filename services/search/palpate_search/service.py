@@ -14,8 +14,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
-from palpate_search.posterior import Policy, Posterior, policy
-from palpate_search.presses import Budget, Press, Task
+from palpate_search.posterior import Budget, Policy, Posterior, Press, Task, policy
 
 FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})

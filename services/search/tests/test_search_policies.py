@@ -13,10 +13,9 @@ from scipy.stats import multivariate_normal
 
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, press_belly, suite
-from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import field_covariances, lump_covariance
 from palpate_assessment.shapes import Bump
-from palpate_assessment.standard import USUAL
+from palpate_assessment.standard import USUAL, load_calibration
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario.press import DEPTH_M
 from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
@@ -33,10 +32,12 @@ from palpate_search.posterior import (
     STROKE_SHARE,
     SURFACE_SHARE,
     USUAL_N,
+    Budget,
     Posterior,
+    Press,
+    Task,
     policy,
 )
-from palpate_search.presses import Budget, Press, Task
 from palpate_search.service import TUNING, check_request, create, next_press
 
 DECIDED = (0.05, 0.0)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from palpate_bus.messages.codes import HoldCause, StopCause, StopLevel
-from palpate_supervisor.watch import Breach
+from palpate_supervisor.judge import Breach
 
 
 class LatchTuning(NamedTuple):

@@ -1,4 +1,5 @@
-"""Two senses of the force at the tool, F/T sensor and joint torques, and how they compare.
+"""Two senses of the force at the tool, F/T sensor and joint torques, and how they compare; its position, speed and external force
+from these measurements only; the perceived rest surface.
 
 Both are tared in free air. The F/T sensor S reads in its axes
 
@@ -16,16 +17,68 @@ air by gradient descent. Weighted least squares gives the force that the joints 
 In a direction that no joint feels (a singular posture) the prior F_max decides: zero instead of amplified noise. After a reversal
 sd also contains what is not yet known of the friction, which shrinks with the error of the gradient descent. The gain G is the
 regression of the reading on the known weight and inertia while the tool moves freely.
+
+The joints' residual is that of the momentum observer of De Luca and Haddadin,
+
+    r = K_O (p - integral(tau + C^T qd - g + r) dt),    p = M(q) qd
+
+with the measured joint torques tau, the Coriolis matrix C and the gravity torques g of the nominal arm (De Luca et al., IROS
+2006, doi 10.1109/IROS.2006.282053; Haddadin et al., T-RO 2017, doi 10.1109/TRO.2017.2723903). It follows the external torques of
+the joints with the time constant 1 / K_O.
 """
 
-from math import exp
+from math import exp, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
-from palpate_supervisor.observer import GAIN_PER_S
+from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.numerics.vectors import nearest_vertex
+from palpate_models.robot.arm import urdf
+from palpate_models.scenario.schema import CommandLevel, Robot
+
+_WORLD_AXES: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+GAIN_PER_S: Final = 30.0
+"""K_O. It filters the gears' ripple."""
+GAP_S: Final = 0.05
+"""Time without measurements after which the momentum cannot be balanced."""
+
+
+class MomentumObserver:
+    """External torques of any arm that pinocchio models, with n joints.
+
+    An arm without torque sensors could give its motor currents times the torque constants, less its friction model.
+    """
+
+    def __init__(self, model: pin.Model, frame: str) -> None:
+        self._model, self._data, self._frame = model, model.createData(), model.getFrameId(frame)
+        self.residual: Array = np.zeros(model.nv)
+        """r, the external joint torques [N m], shape (n,)."""
+        self.J_W: Array = np.zeros((3, model.nv))
+        """Jacobian of the frame's origin in world axes, shape (3, n)."""
+        self._integral: Array | None = None
+        self._torque = self.residual
+
+    def update(self, q: Array, qd: Array, torque: Array, dt_s: float) -> None:
+        """Advance by `dt_s` [s], in which `q` [rad], `qd` [rad/s] and `torque` [N m], shapes (n,), were measured on average."""
+        model, data = self._model, self._data
+        momentum = pin.crba(model, data, q) @ qd
+        gravity = pin.computeGeneralizedGravity(model, data, q)
+        coriolis = pin.computeCoriolisMatrix(model, data, q, qd)
+        if self._integral is None or dt_s > GAP_S:  # continues with the last residual
+            self._integral, self._torque = momentum - self.residual / GAIN_PER_S, torque
+            dt_s = 0.0
+        # Momentum is that of the middle of the time; the torque between two middles is the mean of both.
+        self._integral = self._integral + dt_s * ((torque + self._torque) / 2 + qd @ coriolis - gravity + self.residual)
+        self._torque = torque
+        self.residual = GAIN_PER_S * (momentum - self._integral)
+        self.place(q)
+
+    def place(self, q: Array) -> None:
+        """Set the Jacobian alone, for an arm without torque sensors."""
+        self.J_W = pin.computeFrameJacobian(self._model, self._data, q, self._frame, _WORLD_AXES)[:3]
 
 
 class SensesTuning(NamedTuple):
@@ -233,3 +286,114 @@ def _compare(
     joint_sd = np.hypot(1.0, tuning.damping_nms * sums[4] / tuning.torque_sd_nm) / np.sqrt(np.linalg.eigvalsh(information)[0])
     forces = _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift
     return *forces, gain, sums[1], noise, rest_noise, joint_sd
+
+
+class BiasTuning(NamedTuple):
+    """Limits within which a reading counts as sensor bias."""
+
+    longest_s: float = 1.0
+    """Longest time of rest whose mean is the bias: a sensor that drifts while the arm waits must not be taken for true."""
+    largest_n: float = 6.0
+    """A larger force before the first motion is contact, not bias: poor sensors have up to 5.2 N of bias."""
+
+
+BIAS = BiasTuning()
+OVER_M = 0.015
+"""A tool is over the perceived surface up to this distance along it from the nearest vertex; the mesh has 5 mm."""
+
+
+class Tool(NamedTuple):
+    """Measured state of the indenter."""
+
+    p_W: Array
+    """Centre of the sphere [m], shape (3,)."""
+    speed: float
+    """Speed of the centre [m/s]."""
+    force: float
+    """Magnitude of the external force [N]: the larger of both senses. By the F/T sensor: minus tool weight and first bias."""
+    joint_force: float = 0.0
+    """Magnitude of the external force by the joints alone [N]."""
+    contact_force: float = 0.0
+    """As `force`, but by the F/T sensor also minus the inertia of the tool: a tool that a fast arm shakes touches nothing."""
+
+
+class ToolSense:
+    """Evaluates tool state from joint state and F/T reading. The sensor bias is the mean of the first second of rest."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
+        self._data = self._model.createData()
+        self._observer = MomentumObserver(self._model, "indenter")
+        self._senses = ForceSenses(self._model.nv, BY_CURRENT if robot.level is CommandLevel.POSITION else BY_SENSORS)
+        self._mass = robot.tool_mass_kg
+        self._velocity_W: Array | None = None
+        self.comparison: ForceComparison
+        """Comparison of both senses after the latest measurement."""
+        self._indenter = self._model.getFrameId("indenter")
+        self._sensor = self._model.getFrameId("ft_sensor")
+        self._p_WI: Array = self._data.oMf[self._indenter].translation
+        self._R_SW: Array = self._data.oMf[self._sensor].rotation.T
+        """Views of pinocchio's latest result."""
+        self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
+        self._bias_S, self._rested, self._rested_s, self._moved = np.zeros(3), 0, 0.0, False
+
+    def sense(self, measured: Measurement, dt_s: float, clear: bool = False) -> Tool:
+        """Return the tool state of a measurement that comes `dt_s` [s] after the one before; `clear`: there is no patient."""
+        model, data = self._model, self._data
+        q, qd, wrench_S, torque = measured
+        pin.forwardKinematics(model, data, q)
+        pin.updateFramePlacement(model, data, self._indenter)
+        pin.updateFramePlacement(model, data, self._sensor)
+        force_S = wrench_S[:3] - self._R_SW @ self._weight_W
+        observed = self._observer
+        if len(torque):
+            observed.update(q, qd, torque, dt_s)
+        else:
+            observed.place(q)
+        velocity_W = observed.J_W @ qd
+        before_W = velocity_W if self._velocity_W is None else self._velocity_W
+        self._velocity_W = velocity_W
+        acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
+        inertia_S = -self._mass * (self._R_SW @ acceleration_W)
+        residual = observed.residual
+        if not len(torque):  # such an arm has one sense: the F/T sensor takes the place of the other, and both agree
+            measured = measured._replace(torque=np.zeros(model.nv))
+            residual = observed.J_W.T @ self._R_SW.T @ (force_S - inertia_S)
+        speed = _length(velocity_W)
+        over = self._rested_s > BIAS.longest_s
+        self._moved = self._moved or over or speed > BY_SENSORS.still_mps or _length(force_S) > BIAS.largest_n
+        if not self._moved:
+            self._rested, self._rested_s = self._rested + 1, self._rested_s + dt_s
+            self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
+        load_S, free = self._R_SW @ self._weight_W + inertia_S, (not self._moved, clear)
+        self.comparison = self._senses.compare(measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, free)
+        ft_S, joints = force_S - self._bias_S, self.comparison.joint_force
+        force, contact_force = (max(_length(felt_S), joints) for felt_S in (ft_S, ft_S - inertia_S))
+        return Tool(self._p_WI.copy(), speed, force, joints, contact_force)
+
+
+def _length(x: Array) -> float:
+    return sqrt(float(x @ x))
+
+
+class RestSurface:
+    """Depth below the perceived rest surface: the sphere against the tangent plane of the nearest vertex.
+
+    Deliberately independent of planning's splines: on a 5 mm mesh of 0.25 m radius the plane is off by less than 0.05 mm.
+    """
+
+    def __init__(self, vertices_W: Array, normals_W: Array, radius: float) -> None:
+        """Take vertices [m] and outward unit normals, shapes (n, 3), and the sphere's `radius` [m].
+
+        Raises ValueError for an empty mesh or different shapes.
+        """
+        if vertices_W.shape != normals_W.shape or not len(vertices_W):
+            raise ValueError(f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: expected one shape")
+        self._vertices, self._normals, self._radius = np.ascontiguousarray(vertices_W, float), normals_W, radius
+
+    def depth(self, p_W: Array) -> tuple[float, bool]:
+        """Return the depth of the sphere's deepest point [m], negative above the surface, and True if it is over the surface."""
+        _, i = nearest_vertex(p_W, self._vertices)
+        gap = p_W - self._vertices[i]
+        distance = float(self._normals[i] @ gap)
+        return self._radius - distance, float(gap @ gap) - distance**2 < OVER_M**2

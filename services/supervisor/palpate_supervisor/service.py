@@ -12,14 +12,11 @@ from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
 from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_supervisor.judge import DepthAgreement, MotionAgreement, SensorJudge
+from palpate_models.scenario.schema import CommandLevel, ExamInput, Scenario
+from palpate_supervisor.judge import Breach, DepthAgreement, LimitWatch, MotionAgreement, SensorJudge
 from palpate_supervisor.latch import RECOVERABLE, RECOVERABLE_STIFF, Latch
-from palpate_supervisor.senses import Measurement
-from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import Breach, LimitWatch
+from palpate_supervisor.senses import Measurement, RestSurface, Tool, ToolSense
 
 LOSS_LEVELS = (("control", StopLevel.EMERGENCY), ("planning", StopLevel.EMERGENCY), ("assessment", StopLevel.SOFT_STOP))
 """Stop level when a role is lost. Without control or planning the arm must stand still; without assessment pressing is

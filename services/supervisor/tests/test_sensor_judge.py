@@ -15,8 +15,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_supervisor.judge import EXAM, FT, JOINTS, DepthAgreement, MotionAgreement, SensorJudge
-from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement
-from palpate_supervisor.tool import ToolSense
+from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement, ToolSense
 
 ROBOT = exam_input(load_scenario("clean")).robot
 DT, LIE_S, PRESS_S, END_S = 0.01, 8.0, 7.0, 12.0

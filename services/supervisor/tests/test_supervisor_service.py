@@ -18,11 +18,10 @@ from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Limits
 from palpate_supervisor import latch as latch_module, service as service_module
+from palpate_supervisor.judge import LIMITS, Breach, LimitWatch
 from palpate_supervisor.latch import Latch
-from palpate_supervisor.senses import Measurement
+from palpate_supervisor.senses import Measurement, RestSurface, Tool, ToolSense
 from palpate_supervisor.service import SupervisorService, create
-from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import TUNING, Breach, LimitWatch
 
 KNOWN = exam_input(load_scenario("clean"))
 
@@ -198,7 +197,7 @@ def test_the_worst_counts_and_the_first_of_equals() -> None:
     assert [stop.level for stop in latch.stops] == [StopLevel.EMERGENCY]
 
 
-@pytest.mark.parametrize("timeout_ns", [0, TUNING.rising_timeout_ns])
+@pytest.mark.parametrize("timeout_ns", [0, LIMITS.rising_timeout_ns])
 def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop_sooner_if_the_force_rises(timeout_ns: int) -> None:
     soft = SOFT._replace(timeout_ns=timeout_ns) if timeout_ns else SOFT
     steps = soft.timeout_ns // (10 * MS) + 1
@@ -255,14 +254,14 @@ def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended_or_grows_wo
 
 
 def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
-    latch = latch_after(*([[SOFT], []] * (TUNING.soft_stop_timeout_ns // (20 * MS) + 2)))
+    latch = latch_after(*([[SOFT], []] * (LIMITS.soft_stop_timeout_ns // (20 * MS) + 2)))
     assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
     latch = Latch()
     latch.update(0, [Breach(StopLevel.SOFT_STOP, StopCause.OPERATOR, "enough")], False)
-    for t in range(1000 * MS, 1000 * MS + TUNING.soft_stop_timeout_ns + 20 * MS, 10 * MS):
+    for t in range(1000 * MS, 1000 * MS + LIMITS.soft_stop_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [SOFT], False)
     assert (latch.level, latch.cause) == (StopLevel.EMERGENCY, StopCause.UNHEEDED)
 

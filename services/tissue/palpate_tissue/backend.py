@@ -6,18 +6,12 @@ from math import isfinite
 import numpy as np
 
 from palpate_models.numerics.frames import Array, Indices, Mask
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
-from palpate_tissue.contact import skin
-
-
-def require_finite(motion: Array) -> None:
-    """Raise ValueError unless the sphere's motion is finite: rows position [m], velocity [m/s], angular velocity [rad/s]."""
-    if not isfinite(sum(motion.ravel().tolist())):
-        raise ValueError(f"tissue: position, velocity, angular velocity of the indenter are not finite: {motion.tolist()}")
+from palpate_tissue.contact import VertexSearch, skin
 
 
 class TissueBackend(ABC):
@@ -101,15 +95,36 @@ class TissueBackend(ABC):
 
 
 class SkinBody(TissueBackend):
-    """A body whose skin shears under the sphere."""
+    """A body whose skin shears under the sphere; subclasses step its free vertices."""
 
-    def __init__(self, model: PhantomModel, stiffness: Stiffness | None, breathing: BreathingCurve, dt: float) -> None:
+    def __init__(
+        self, model: PhantomModel, stiffness: Stiffness | None, breathing: BreathingCurve, dt: float, margin_m: float
+    ) -> None:
+        """`margin_m`: motion of the sphere after which the vertices near it are searched again."""
         super().__init__(model, breathing, dt)
         self._stiffness = stiffness or Stiffness()
         self.friction = skin(self._stiffness.friction, model.background)
         self.disturbed = False
         """True once anything has moved."""
         self._excursion = 0.0
+        self._free = np.flatnonzero(~model.fixed)
+        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, margin_m)
+        self._motion: Array = np.zeros((3, 3))
+        """Rows: the sphere's centre [m], velocity [m/s] and angular velocity [rad/s]."""
+
+    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
+        """See `TissueBackend`."""
+        motion = self._motion
+        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
+        if not isfinite(sum(motion.ravel().tolist())):
+            raise ValueError(f"tissue: position, velocity, angular velocity of the indenter are not finite: {motion.tolist()}")
+        wrench = self._press(t_s, p_A.tolist(), radius)
+        self.guard(v_A)
+        return wrench[:3], wrench[3:]
+
+    @abstractmethod
+    def _press(self, t_s: float, p: list[float], radius: float) -> Array:
+        """Advance by one period under `_motion`, to a sphere at `p` [m]; return force [N] and torque [N m] on it, shape (6,)."""
 
     def settle(self) -> None:
         """See `TissueBackend`."""

@@ -9,12 +9,11 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_bus.messages import NS, Message, Point, ToolState, WrenchStamped
 from palpate_bus.messages.geometry import pose_matrix, pose_message, twist, twist_message, vector, wrench, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.numerics.frames import Array, inverse, matrix
+from palpate_models.numerics.frames import Array, Array32, inverse, matrix
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
@@ -124,6 +123,6 @@ class _ConvertedInbox:
         return self._inbox.lost(role)
 
 
-def _transform(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
+def _transform(values: Array32, R: Array, p: Array | float = 0.0) -> Array32:
     """Return n points or vectors, concatenated, shape (3 n,), rotated by R and translated by p [m]."""
     return np.asarray(values.reshape(-1, 3) @ R.T + p, dtype=np.float32).ravel()

@@ -9,7 +9,6 @@ from math import hypot, sqrt
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import IndentationTruth, Message, PatientTruth, PhantomTruth, Point, SurfaceMesh, WrenchStamped
@@ -17,8 +16,8 @@ from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_errors import UserError, restate
-from palpate_models.numerics.frames import Array, apply, inverse, matrix
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.numerics.frames import Array, Array32, apply, inverse, matrix
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
@@ -179,7 +178,7 @@ class TissueService(Service):
         )
 
 
-def _flat(vectors: Array) -> NDArray[np.float32]:
+def _flat(vectors: Array) -> Array32:
     """Return the columns of an array of shape (3, n), concatenated, shape (3 n,)."""
     x, y, z = vectors.astype(np.float32)
     return np.stack((x, y, z), axis=1).ravel()

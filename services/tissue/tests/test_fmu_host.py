@@ -24,8 +24,8 @@ from palpate_fmu.reading import FmuError
 from palpate_models.numerics.frames import matrix
 from palpate_models.scenario.load import ScenarioError, load_scenario, restrict_to_view, true_pose
 from palpate_models.scenario.schema import Scenario, TissueChoice
-from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.service import FmuService, create, host, hosted
+from palpate_tissue.backends.fmu.wiring import FmuMap, MapError, load_map
 from palpate_tissue.backends.winkler.service import create as create_winkler
 
 VERSIONS = pytest.mark.parametrize("version", [2, 3])

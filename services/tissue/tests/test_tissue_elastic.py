@@ -18,10 +18,10 @@ from palpate_bus.messages.codec import decode, encode
 from palpate_bus.testing import HandInbox
 from palpate_errors import UserError
 from palpate_models.patient import wall
-from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.healthy import tension_of_ratio
+from palpate_models.patient.motion import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import MEDIAN
 from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import Compliance, ComplianceTuning, LayerKernel, compliance

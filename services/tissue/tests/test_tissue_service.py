@@ -14,11 +14,10 @@ from palpate_bus.messages.geometry import pose_matrix, vector
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array, apply, matrix
-from palpate_models.patient.breathing import Breathing, BreathingCurve
-from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.patient.healthy import tension_of_ratio
+from palpate_models.patient.motion import BodyMotion, Breathing, BreathingCurve, Motion
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
-from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import FADING_S
 from palpate_models.scenario.errors import Errors, PoseErrors
 from palpate_models.scenario.load import true_pose

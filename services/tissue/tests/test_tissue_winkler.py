@@ -9,10 +9,10 @@ from scipy.sparse import csr_array
 
 from palpate_errors import UserError
 from palpate_models.patient import phantom as phantoms
-from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.healthy import DEPTH_M, RADIUS_M, SPEED_MPS
+from palpate_models.patient.motion import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Background, Lesion, Phantom, Stiffness
-from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS
 from palpate_models.patient.wall import MEDIAN, MOST_STIFFENING, Guarding, stress
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, STEP_LIMIT, assemble

@@ -20,8 +20,7 @@ from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.recordings import RecordedMessage, Recording, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
-from palpate_camera.inputs import CameraError, CameraInput, Frame, StaticTransforms
-from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, CameraError, CameraInput, Frame, StaticTransforms
 from palpate_errors import restate
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Scenario

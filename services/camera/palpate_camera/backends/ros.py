@@ -10,8 +10,7 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera import messages
-from palpate_camera.inputs import CameraError, CameraInput, StaticTransforms
-from palpate_camera.messages import FRAME
+from palpate_camera.messages import FRAME, CameraError, CameraInput, StaticTransforms
 from palpate_models.scenario.schema import RosCamera, Scenario
 
 

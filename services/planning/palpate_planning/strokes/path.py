@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Ints, path_length
-from palpate_planning.motion.timing import SpeedLimit
+from palpate_planning.motion.planner import SpeedLimit
 from palpate_planning.wall.surface import CubicPieces, PerceivedSurface, cubic_at
 
 

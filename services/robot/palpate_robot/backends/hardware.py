@@ -21,8 +21,7 @@ from palpate_bus.messages.geometry import wrench, wrench_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import TOOL, arm_of, urdf
-from palpate_models.scenario.arm_file import CommandLevel
-from palpate_models.scenario.schema import ExamInput, Robot, Scenario
+from palpate_models.scenario.schema import CommandLevel, ExamInput, Robot, Scenario
 from palpate_robot.backends.arm_port import ArmPort
 from palpate_robot.driver import Command, Driver
 from palpate_robot.position_loop import TUNING as LOOP

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from palpate_models.numerics.frames import Array
-from palpate_search.posterior import Posterior
-from palpate_search.presses import PRESSES, Budget
+from palpate_search.posterior import PRESSES, Budget, Posterior
 
 
 def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:

@@ -12,11 +12,10 @@ from scipy.stats import norm
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
-from palpate_assessment.calibration import load_calibration
+from palpate_assessment.standard import load_calibration
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
-from palpate_search.posterior import Posterior
-from palpate_search.presses import PRESSES, Budget, Task
+from palpate_search.posterior import PRESSES, Budget, Posterior, Task
 
 
 class ProcessTuning(NamedTuple):

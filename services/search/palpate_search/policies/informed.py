@@ -12,13 +12,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from palpate_assessment.calibration import load_calibration
-from palpate_assessment.standard import USUAL
+from palpate_assessment.standard import USUAL, load_calibration
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Indices
 from palpate_models.scenario import press
-from palpate_search.posterior import Posterior
-from palpate_search.presses import Budget, press_duration
+from palpate_search.posterior import Budget, Posterior, press_duration
 
 
 class InformationGrid(NamedTuple):

@@ -10,8 +10,7 @@ from importlib.resources import as_file, files
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_search.posterior import Posterior, maps
-from palpate_search.presses import Budget
+from palpate_search.posterior import Budget, Posterior, maps
 
 WEIGHTS = "ppo.npz"
 

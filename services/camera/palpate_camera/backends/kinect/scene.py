@@ -20,16 +20,15 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from palpate_camera.messages import Pinhole
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, Mask, apply, inverse
+from palpate_models.numerics.frames import Array, Array32, Mask, Unsigned, apply, inverse
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
 
-Image = NDArray[np.float32]
+Image = Array32
 _NEAR_M = 1e-3
 """The image of a triangle with a corner nearer than this is looked for everywhere."""
 
@@ -42,7 +41,7 @@ def _bounds(x: float, y: float, z: float, size: int) -> tuple[int, int]:
 
 
 @compiled
-def rasterise(p_C: Array, triangles: NDArray[np.uint32], lens: Array, w: Image, gu: Image, gv: Image, cos: Image) -> None:
+def rasterise(p_C: Array, triangles: Unsigned, lens: Array, w: Image, gu: Image, gv: Image, cos: Image) -> None:
     """Draw a mesh into a view where it is nearer: `w`, `gu`, `gv` and `cos` as in `scene.View`.
 
     `p_C`: vertices [m], shape (n, 3); `triangles`: shape (m, 3); `lens`: fx, fy, cx, cy [px].
@@ -89,7 +88,7 @@ def rasterise(p_C: Array, triangles: NDArray[np.uint32], lens: Array, w: Image, 
                     w[v, u], gu[v, u], gv[v, u], cos[v, u] = near, du, dv, near / (normal * ray)
 
 
-Triangles = NDArray[np.uint32]
+Triangles = Unsigned
 
 
 class Mesh(NamedTuple):

@@ -5,13 +5,11 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.settings import BusConfigError, Settings
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import ExamInput, Scenario
+from palpate_models.scenario.schema import CommandLevel, ExamInput, Scenario
 from palpate_robot.backends.arm_port import ArmPort
 from palpate_robot.backends.hardware import HardwareService, InnerLoop
-from palpate_robot.backends.lbr.arm import MeasuredLbr
-from palpate_robot.backends.lbr.port import ZenohPort
+from palpate_robot.backends.lbr.port import MeasuredLbr, ZenohPort
 
 DAMPING: Final = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
 """Maximum joint damping in a hold [N m s/rad] (assumed). The overlay is one to three cycles late, on a filtered speed. Below the

@@ -12,8 +12,7 @@ import numpy as np
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.scenario.schema import RobotDriver
-from palpate_robot.backends.lbr.arm import MeasuredLbr
-from palpate_robot.backends.lbr.port import NAMESPACE, STATE, TORQUE_COMMAND, LBRTorqueCommand
+from palpate_robot.backends.lbr.port import NAMESPACE, STATE, TORQUE_COMMAND, LBRTorqueCommand, MeasuredLbr
 from palpate_robot.backends.watchdog import Watchdog, watch
 
 DAMPING: Final = np.full(7, 8.0)

@@ -21,9 +21,8 @@ from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import load_scenario, plant_input
-from palpate_models.scenario.schema import PlantInput
+from palpate_models.scenario.schema import CommandLevel, PlantInput
 from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import EmulatedArm, serve
 from palpate_robot.backends.hardware import GravityModel, tool_load

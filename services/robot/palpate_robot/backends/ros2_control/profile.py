@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from palpate_errors import UserError
-from palpate_models.scenario.arm_file import CommandLevel
-from palpate_models.scenario.schema import Robot
+from palpate_models.scenario.schema import CommandLevel, Robot
 from palpate_models.section import Section, read_model
 from palpate_robot.backends.ros2_control.rules import Stack
 

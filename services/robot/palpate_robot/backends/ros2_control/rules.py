@@ -12,7 +12,7 @@ import numpy as np
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
-from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.schema import CommandLevel
 
 
 class Stack(StrEnum):

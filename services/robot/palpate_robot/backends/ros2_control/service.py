@@ -18,12 +18,10 @@ from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, tool_pose
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
-from palpate_models.scenario.schema import ExamInput, Scenario
+from palpate_models.scenario.schema import CommandLevel, ExamInput, Scenario
 from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
-from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import FlangePose, Ros2Port, ZenohRos2Port
+from palpate_robot.backends.ros2_control.port import FlangePose, MeasuredJoints, Ros2Port, ZenohRos2Port
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 
 

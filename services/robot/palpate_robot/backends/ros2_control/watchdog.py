@@ -13,11 +13,9 @@ from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario
-from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import ARRAY, POSE, STATE, FlangePose, array_message, pose_command
+from palpate_models.scenario.schema import CommandLevel, Robot
+from palpate_robot.backends.ros2_control.port import ARRAY, POSE, STATE, FlangePose, MeasuredJoints, array_message, pose_command
 from palpate_robot.backends.ros2_control.profile import profile_of
 from palpate_robot.backends.watchdog import Watchdog, watch
 

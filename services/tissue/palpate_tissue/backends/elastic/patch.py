@@ -80,7 +80,7 @@ class ContactSolver:
 
 
 MUSCLE = 1.06
-"""Factor on muscle tension relative to the foundation (`palpate_models.patient.tension`): the solid spreads the load wider, so
+"""Factor on muscle tension relative to the foundation (`palpate_models.patient.healthy`): the solid spreads the load wider, so
 the press that defines the guarding ratio would measure 3 % less. With it the ratio is met within 2 %."""
 
 

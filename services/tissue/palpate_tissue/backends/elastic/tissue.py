@@ -17,13 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate_models.numerics.frames import Array, Indices, Mask
-from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.motion import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import SkinBody, TissueBackend, require_finite
+from palpate_tissue.backend import SkinBody, TissueBackend
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPatch, VertexSprings
-from palpate_tissue.contact import Sphere, VertexSearch, add_friction
+from palpate_tissue.contact import Sphere, add_friction
 
 
 class ElasticTuning(NamedTuple):
@@ -75,7 +75,7 @@ class ElasticTissue(SkinBody):
         breathing: BreathingCurve = STILL,
         dt: float = 1e-3,
     ) -> None:
-        super().__init__(model, stiffness, breathing, dt)
+        super().__init__(model, stiffness, breathing, dt, TUNING.margin_m)
         self.compliance = compliance
         self._prony_g = self._stiffness.prony_g
         self._advance, self._feed = update_rule(self._stiffness, dt)
@@ -86,17 +86,14 @@ class ElasticTissue(SkinBody):
         )
         self._resists = bool(model.stiffening.any() or model.tension.any())
         self._beyond = TUNING.muscle_beyond_m if model.tension.any() else TUNING.springs_beyond_m
-        self._search = VertexSearch(model.vertices[free], model.normals[free], breathing.largest_m, TUNING.margin_m)
         self._state = np.zeros((len(self._feed), len(free)))
         """u and y_k of the free vertices `_behind` steps ago."""
         self._behind = 0
         self._patch: ElasticPatch | None = None
 
-    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """See `TissueBackend`."""
-        motion = np.array((p_A, v_A, np.zeros(3) if w_A is None else w_A))
-        require_finite(motion)
-        p, velocity, spin = motion.tolist()
+    def _press(self, t_s: float, p: list[float], radius: float) -> Array:
+        """See `SkinBody`."""
+        p_A, velocity, spin = self._motion
         self._excursion = self.excursion(t_s)
         patch = self._patch
         if patch is None or not patch.near.holds(p, radius):
@@ -110,12 +107,11 @@ class ElasticTissue(SkinBody):
         if len(patch.vertex) and patch.step(w, self._advance, self._feed, self.activation):
             self.disturbed = True
             self._set_touching(True)
-            sphere = Sphere(tuple(p), tuple(velocity), tuple(spin), radius)
+            sphere = Sphere(tuple(p_A.tolist()), tuple(velocity.tolist()), tuple(spin.tolist()), radius)
             add_friction(self.friction, sphere, patch.push(), self.dt, wrench)
-            self.guard(v_A)
         else:
             self._set_touching(False)
-        return wrench[:3], wrench[3:]
+        return wrench
 
     def idle(self, t_s: float) -> None:
         """See `TissueBackend`."""

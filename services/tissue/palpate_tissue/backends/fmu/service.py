@@ -22,8 +22,7 @@ from palpate_models.numerics.frames import Array, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
-from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
-from palpate_tissue.backends.fmu.wiring import Wiring
+from palpate_tissue.backends.fmu.wiring import FmuMap, MapError, Wiring, load_map
 from palpate_tissue.moving import carry
 
 _log = logging.getLogger("palpate.tissue")

@@ -14,19 +14,18 @@ at 10 mm depth on each). `docs/scoring.md` compares forces with those of the exp
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array, Indices
+from palpate_models.numerics.frames import Array, Indices, Ints, Unsigned
 from palpate_models.numerics.vectors import divide, row
 from palpate_models.patient import wall as wall_law
-from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.motion import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import SkinBody, require_finite
+from palpate_tissue.backend import SkinBody
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
-from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, VertexSearch, add_friction, add_vertex, meet
+from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, add_friction, add_vertex, meet
 
 SWEEPS = 3
 """Over-relaxation sweeps per step near the sphere."""
@@ -43,12 +42,12 @@ class ImplicitWall(NamedTuple):
     """Strain u - sum_k y_k [m], shape (n,)."""
     y: Array
     """Relaxed displacement [m], shape (n, b)."""
-    clock: NDArray[np.int64]
+    clock: Ints
     """Number of the last step of each vertex, shape (n,); vertices near the sphere are at the newest."""
     table: Array
     """Columns `DRAG` to `TENSION` of each vertex, shape (n, 6)."""
-    indptr: NDArray[np.uint32]
-    indices: NDArray[np.uint32]
+    indptr: Unsigned
+    indices: Unsigned
     K: Array
     """Instantaneous stiffness [N/m], a matrix of shape (n, n) in CSR form; rows of fixed vertices are empty."""
     decay: Array
@@ -247,32 +246,25 @@ class ImplicitTissue(SkinBody):
     def __init__(
         self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 0.01
     ) -> None:
-        super().__init__(model, stiffness, breathing, dt)
+        super().__init__(model, stiffness, breathing, dt, TUNING.margin_m)
         self._reach_m = TUNING.reach_lengths * self._stiffness.length_m
         self._every = max(1, round(TUNING.far_s / dt))
         self._wall = implicit_wall(model, self._stiffness, dt, self._every)
-        self._free = np.flatnonzero(~model.fixed)
-        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, TUNING.margin_m)
         self._tree = cKDTree(model.vertices[self._free])
         self._steps = self._sprung = 0
         self._near: Near | None = None
         self._patch: ImplicitPatch | None = None
-        self._motion: Array = np.zeros((3, 3))
 
-    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """See `TissueBackend`; the wrench is that at the end of the step."""
-        motion, p = self._motion, p_A.tolist()
-        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
-        require_finite(motion)
+    def _press(self, t_s: float, p: list[float], radius: float) -> Array:
+        """See `SkinBody`; the wrench is that at the end of the step."""
         self._tick(t_s)
         if self._near is None or self._patch is None or not self._near.holds(p, radius):
             self._patch = self._gather(p, radius)
         touching, wrench = press(
-            self._wall, self._patch, self.friction, motion, radius, self._excursion, self.activation, self.dt
+            self._wall, self._patch, self.friction, self._motion, radius, self._excursion, self.activation, self.dt
         )
         self._set_touching(touching)
-        self.guard(v_A)
-        return wrench[:3], wrench[3:]
+        return wrench
 
     def idle(self, t_s: float) -> None:
         """See `TissueBackend`."""

@@ -3,7 +3,7 @@
 from typing import Any
 
 from palpate_bus.service import Service
-from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.motion import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

@@ -24,14 +24,14 @@ from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Indices, Mask
 from palpate_models.numerics.vectors import divide, row
 from palpate_models.patient import wall as wall_law
-from palpate_models.patient.breathing import STILL, BreathingCurve
+from palpate_models.patient.motion import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import SkinBody, TissueBackend, require_finite
+from palpate_tissue.backend import SkinBody, TissueBackend
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.backends.winkler.presses import standard_presses
-from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, VertexSearch, add_friction, add_vertex, meet
+from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, add_friction, add_vertex, meet
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: numba checks signed indices for negative values, which doubles the cost of the step."""
@@ -184,7 +184,7 @@ class WinklerTissue(SkinBody):
     def __init__(
         self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3
     ) -> None:
-        super().__init__(model, stiffness, breathing, dt)
+        super().__init__(model, stiffness, breathing, dt, _MARGIN_M)
         stiffness = self._stiffness
         self.mechanics = assemble(model, stiffness)
         self.substeps = self.mechanics.substeps(dt)
@@ -196,37 +196,28 @@ class WinklerTissue(SkinBody):
         self._prony_g = stiffness.prony_g
         self._wall = self._wall_of(stiffness, h)
         self._gain = self.mechanics.damping / h
-        self._free = np.flatnonzero(~model.fixed)
-        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._near: Near | None = None
         self._patch = self._no_patch = self._patch_of(_NONE)
-        self._motion: Array = np.zeros((3, 3))
-        """Rows: the sphere's centre [m], velocity [m/s] and angular velocity [rad/s]."""
         self._previous_centre: list[float] | None = None
         """The sphere's centre one period ago [m]."""
         self._advance(self._no_patch, 0.0, np.zeros(6))  # compiles it before the first contact
 
-    def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """See `TissueBackend`. The period has equal sub-steps, in which the sphere moves on a straight line."""
-        motion, end = self._motion, p_A.tolist()
-        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
-        require_finite(motion)
-        start = self._previous_centre or end
-        self._previous_centre = end
+    def _press(self, t_s: float, p: list[float], radius: float) -> Array:
+        """See `SkinBody`. The period has equal sub-steps, in which the sphere moves on a straight line."""
+        start = self._previous_centre or p
+        self._previous_centre = p
         wrench = np.zeros(6)
         if self.substeps == 1:
-            self._substep(self.excursion(t_s), end, radius, wrench)
-            self.guard(v_A)
-            return wrench[:3], wrench[3:]
+            self._substep(self.excursion(t_s), p, radius, wrench)
+            return wrench
         part = np.zeros(6)
         for k in range(1, self.substeps + 1):
             share = k / self.substeps
-            motion[0] = at = [a + share * (b - a) for a, b in zip(start, end, strict=True)]
+            self._motion[0] = at = [a + share * (b - a) for a, b in zip(start, p, strict=True)]
             part[:] = 0.0
             self._substep(self.excursion(t_s - self.dt * (1 - share)), at, radius, part)
             wrench += part / self.substeps
-        self.guard(v_A)
-        return wrench[:3], wrench[3:]
+        return wrench
 
     def idle(self, t_s: float) -> None:
         """See `TissueBackend`."""
