@@ -86,7 +86,7 @@ def check_tissue(scenario: Scenario, phantom: PhantomModel) -> None:
     """Raise UserError if the default tissue could not be stepped on this phantom's mesh."""
     from palpate_bus.contract import contract
     from palpate_bus.messages import NS
-    from palpate_tissue.backends.winkler.mechanics import assemble
+    from palpate_tissue.backends.winkler.implicit import assemble
 
     if scenario.services.tissue == "winkler":
         assemble(phantom, scenario.phantom.stiffness).substeps(contract().roles["tissue"].period / NS)

@@ -34,9 +34,8 @@ from palpate.study.statistics.estimate import LEVEL, Estimate
 from palpate.truth.pressed import PALPABLE
 from palpate_assessment.assess import causes, weigh_all
 from palpate_assessment.detection import FEATURES, FELT, STRUCTURES, SURE, Candidate
-from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
-from palpate_assessment.standard import USUAL, Calibration, load_calibration
+from palpate_assessment.standard import USUAL, Calibration, load_calibration, observe
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario

@@ -28,9 +28,8 @@ from palpate.study.cases import Case, Request, cases_of
 from palpate.study.spec import load_study
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.detection import Candidate
-from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
-from palpate_assessment.standard import USUAL, Calibration, load_calibration
+from palpate_assessment.standard import USUAL, Calibration, load_calibration, observe
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario

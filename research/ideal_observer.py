@@ -25,9 +25,8 @@ from palpate.quick.errors import loop_errors
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.detection import detect
 from palpate_assessment.model import error_covariances, fixed_covariance
-from palpate_assessment.observations import Observations, observe
 from palpate_assessment.shapes import Bump
-from palpate_assessment.standard import USUAL, load_calibration
+from palpate_assessment.standard import USUAL, Observations, load_calibration, observe
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.scenario.load import load_scenario

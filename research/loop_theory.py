@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_control.admittance import TUNING as ADMITTANCE
-from palpate_control.impedance import ImpedanceController
+from palpate_control.impedance import ADMITTANCE, ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
 from palpate_models.numerics.frames import Array
@@ -129,7 +128,7 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> LinearL
 
 
 def admittance_gain(contrast: float, yield_s: float = ADMITTANCE.yield_s) -> float:
-    """Return the largest |L| of `palpate_control.admittance` on a wall `contrast` times the default's, for an ideal arm.
+    """Return the largest |L| of `palpate_control.impedance` on a wall `contrast` times the default's, for an ideal arm.
 
     Below 1 the contact is stable with any delay.
     """

@@ -24,10 +24,9 @@ from palpate.quick.case import assess, examine_quickly
 from palpate.report.results import truth_of_run
 from palpate_assessment.assess import causes, marked_share, weigh_all
 from palpate_assessment.detection import SURE, Candidate
-from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
 from palpate_assessment.shapes import ridge
-from palpate_assessment.standard import USUAL, Calibration, load_calibration
+from palpate_assessment.standard import USUAL, Calibration, load_calibration, observe
 from palpate_bus.messages.codes import FindingKind
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.person import draw_person

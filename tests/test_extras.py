@@ -74,7 +74,7 @@ ON_DEMAND = {
     "palpate_models.robot.urdf_arm.load_arm": "run",
     "palpate_models.robot.urdf_arm.read_arm": "run",
     "palpate_robot.backends.ros2_control.emulator.EmulatedPort": "run",
-    "palpate_robot.service.Plant": "run",
+    "palpate_robot.plant.Plant": "run",
 }
 """Imports of a single function, and the extra that its callers need."""
 NOT_IMPORTED = {"bokeh", "example-robot-data", "stable-baselines3", "torch", "ziglang"}

@@ -16,7 +16,7 @@ from palpate_dashboard import palette
 from palpate_dashboard.replay import messages
 from palpate_dashboard.scene import SCENE, Carry
 from palpate_models.numerics.frames import Array, apply
-from palpate_models.robot import table
+from palpate_models.robot.arm import Box, boxes
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -113,7 +113,7 @@ class Stage:
         self._links = visual_meshes(given.robot)
         self._triangles = rest.surface.triangles.reshape(-1, 3)
         self._rest = rest.surface.vertices.reshape(-1, 3).astype(np.float64)
-        self._still = [_box(part) for part in table.boxes(given.robot)]
+        self._still = [_box(part) for part in boxes(given.robot)]
 
     def bodies(self, moment: Moment) -> list[Body]:
         """Return all bodies at a moment."""
@@ -146,7 +146,7 @@ def _plain(corners: Array, color: Sequence[float]) -> Body:
     return Body(corners, np.tile(color[:3], (len(corners), 1)))
 
 
-def _box(part: table.Box) -> Body:
+def _box(part: Box) -> Body:
     """Return a box, in triangles small enough to be drawn in the order of their distances."""
     mesh = box(extents=part.size, transform=part.X_WB).subdivide_to_size(0.04)
     color = palette.PLINTH if part.name == "robot_base" else palette.SHEET

@@ -18,7 +18,7 @@ from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame, quater
 from palpate_dashboard import palette
 from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
 from palpate_models.patient.mesh import vertex_normals
-from palpate_models.robot import table
+from palpate_models.robot.arm import boxes
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Camera, Robot
 
@@ -109,7 +109,7 @@ class SceneView:
         self._trail: list[Floats] = []
         canvas.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         canvas.log("world/tool/force", rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004]))
-        for box in table.boxes(robot):
+        for box in boxes(robot):
             path = f"world/furniture/{box.name}"
             color = FURNITURE.get(box.name, palette.STEEL)
             canvas.log(path, rr.Transform3D(translation=box.X_WB[:3, 3], mat3x3=box.X_WB[:3, :3]))

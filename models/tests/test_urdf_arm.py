@@ -11,10 +11,9 @@ import yaml
 
 from palpate_errors import UserError
 from palpate_models.robot import arm as robot_arm, lbr
-from palpate_models.robot.arm import TOOL, arm_of, link_names, link_transforms, tool_jacobian, tool_pose, urdf
+from palpate_models.robot.arm import TOOL, Box, arm_of, boxes, link_names, link_transforms, tool_jacobian, tool_pose, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.fitting import enclosing_capsule, seeds_of
-from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.urdf_arm import read_arm
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot

@@ -16,8 +16,7 @@ from matplotlib.patches import Rectangle
 from palpate.run.clearance import clear_postures, scan_targets
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, Mask
-from palpate_models.robot.arm import arm_of
-from palpate_models.robot.table import BASE_SIDE_M, TABLE
+from palpate_models.robot.arm import BASE_SIDE_M, TABLE, arm_of
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement.redundancy import POSTURES, PostureSequence, arm, base_of, casadi, plan_redundancy, surface_frames
 

@@ -37,7 +37,7 @@ from palpate_fmu.reading import DESCRIPTION, binary_folders, read_description, r
 from palpate_inputs import parse_json
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh import load_mesh
-from palpate_models.scenario.checkpoint import FELT, Checkpoint, read_checkpoint
+from palpate_models.scenario.load import FELT, Checkpoint, read_checkpoint
 from palpate_recorder.recover import recover
 from palpate_tissue.backends.fmu.wiring import load_map
 

@@ -24,7 +24,7 @@ from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
 from palpate_models.numerics.frames import apply
 from palpate_models.scenario.schema import Scenario
-from palpate_planning.status import PHASE_OF
+from palpate_planning.course import PHASE_OF
 
 LEAVES_S: Final = 1.0
 """Time from the last stroke to the request for findings."""

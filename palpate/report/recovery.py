@@ -31,8 +31,7 @@ from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult, gave_up
 from palpate_errors import PalpateError
 from palpate_models.numerics.frames import apply, inverse
-from palpate_models.scenario.checkpoint import Checkpoint
-from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
+from palpate_models.scenario.load import Checkpoint, exam_input, restrict_to_view, view_of
 from palpate_models.scenario.schema import Scenario
 
 FOLDER: Final = "resumed"

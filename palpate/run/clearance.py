@@ -7,14 +7,12 @@ import numpy as np
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.phantom import build_phantom
-from palpate_models.robot.arm import arm_of
+from palpate_models.robot.arm import arm_of, boxes
 from palpate_models.robot.fitting import ready_postures
-from palpate_models.robot.table import boxes
 from palpate_models.robot.urdf_arm import home_advice
 from palpate_models.scenario.load import exam_input, true_pose
 from palpate_models.scenario.schema import DEFAULT_ARM, Limits, Robot, Scenario
-from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.scene import CollisionScene
+from palpate_planning.motion.kinematics import ArmKinematics, CollisionScene
 from palpate_planning.placement.redundancy import Batch, PostureSequence, plan_redundancy
 from palpate_planning.strokes.plan import look_postures
 

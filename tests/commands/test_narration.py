@@ -25,7 +25,7 @@ from palpate_bus.messages.codes import Phase, Reason
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam
-from palpate_planning.status import PHASE_OF
+from palpate_planning.course import PHASE_OF
 from palpate_planning.stroke import StrokeStage
 
 EXAM = Exam(region_m=(0.10, 0.06))

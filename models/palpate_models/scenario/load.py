@@ -1,20 +1,24 @@
-"""Loads scenarios from YAML, by name or file, with `--set a.b=c`, and gives each role its view.
+"""Loads scenarios from YAML, by name or file, with `--set a.b=c`, and gives each role its view; and the checkpoint of an
+interrupted examination: its measurements, for the run that resumes it.
 
 Errors name file, line, field, value and what is allowed.
 """
 
+import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from palpate_errors import UserError, restate
-from palpate_inputs import brief, parse_yaml, read_text
-from palpate_models.numerics.frames import matrix, pose_of
+from palpate_inputs import brief, parse_yaml, read_arrays, read_text
+from palpate_models.numerics.frames import Array, matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import ExamInput, PlantInput, Scenario
 from palpate_models.section import Pose, did_you_mean, explain_error
@@ -196,3 +200,59 @@ def true_pose(scenario: Scenario) -> Pose:
     For tissue and scoring only: it needs a scenario with its errors.
     """
     return pose_of(matrix(scenario.exam.pose) @ draw_errors(scenario.errors, scenario.seed).X_AAt)
+
+
+class CheckpointError(UserError):
+    """A checkpoint that cannot be used. Names the file and what is wrong."""
+
+
+FELT = (
+    *("time", "position", "normal", "velocity", "depth", "force", "force_noise", "time_in_contact", "force_limited", "stroke"),
+    *("depth_uncertainty", "exponent"),
+)
+"""Columns of the samples: the fields of `ForceSample` of the assessment."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """State of an examination at its interruption."""
+
+    felt: Mapping[str, Any]
+    """Columns `FELT` of m samples, in A, shape (m,) or (m, 3). Their times [s] are negative: before the resumed run."""
+    left: Array
+    """Targets that were not reached, in A [m], shape (k, 2)."""
+    surface: Array
+    """Vertices of the perceived surface, in A [m], shape (n, 3)."""
+    strokes: int
+    """Number of descents."""
+
+    def remaining_targets(self, targets: Array, spacing: float) -> frozenset[int]:
+        """Return the indices of new targets, in A [m], shape (j, 2), within half a `spacing` [m] of a remaining one."""
+        away = np.linalg.norm(targets[:, None] - self.left, axis=-1)
+        return frozenset(np.flatnonzero((away < spacing / 2).any(axis=1)).tolist())
+
+    def bytes(self) -> bytes:
+        """Return the content of the file."""
+        file = io.BytesIO()
+        np.savez_compressed(file, left=self.left, surface=self.surface, strokes=np.array(self.strokes), **self.felt)
+        return file.getvalue()
+
+
+def read_checkpoint(path: Path | None) -> Checkpoint | None:
+    """Return the checkpoint in a file; None without a path. Raises CheckpointError."""
+    if path is None:
+        return None
+    held = dict(read_arrays(path, path, CheckpointError))
+    with restate((ValueError, KeyError, TypeError), CheckpointError, f"{path}: not a checkpoint of this version"):
+        left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
+        if held.keys() != set(FELT):
+            raise ValueError(f"samples of {', '.join(held)}; expected {', '.join(FELT)}")
+        rows = len(held["time"])
+        wanted: dict[str, tuple[int, ...]] = {
+            name: (rows, 3) if name in ("position", "normal", "velocity") else (rows,) for name in held
+        }
+        wanted |= {"left": (len(left), 2), "surface": (len(surface), 3), "strokes": ()}
+        for name, array in {**held, "left": left, "surface": surface, "strokes": strokes}.items():
+            if array.shape != wanted[name] or array.dtype.kind not in "bif" or not np.isfinite(array).all():
+                raise ValueError(f"{name}: expected finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
+        return Checkpoint(held, left, surface, int(strokes))

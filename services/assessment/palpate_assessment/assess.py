@@ -16,10 +16,9 @@ from scipy.special import chdtrc, expit, log_ndtr, logit
 
 from palpate_assessment.detection import SOFTER, SURE, Candidate, detect
 from palpate_assessment.model import Regression, cholesky_inverse, prior_log_amplitudes
-from palpate_assessment.observations import USABLE, Observations, distance_to_samples, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump, ridge
-from palpate_assessment.standard import USUAL, Calibration, PressStandard
+from palpate_assessment.standard import USABLE, USUAL, Calibration, Observations, PressStandard, distance_to_samples, observe
 from palpate_bus.messages.codes import FindingKind, UnassessedReason
 from palpate_models.numerics.frames import Array, Indices, Mask, Unsigned
 from palpate_models.scenario.schema import Marked

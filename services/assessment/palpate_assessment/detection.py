@@ -18,9 +18,8 @@ from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 
 from palpate_assessment.model import KINDS_OF_ERROR, PRIOR, Regression, cholesky_inverse, fit_log_amplitudes, prior_log_amplitudes
-from palpate_assessment.observations import USABLE, Observations
 from palpate_assessment.shapes import Bump, ridge
-from palpate_assessment.standard import ABDOMEN, LENGTHS
+from palpate_assessment.standard import ABDOMEN, LENGTHS, USABLE, Observations
 from palpate_models.numerics.frames import Array
 
 Found = tuple[Bump | None, float]

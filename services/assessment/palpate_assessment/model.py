@@ -19,9 +19,8 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
-from palpate_assessment.observations import Observations
 from palpate_assessment.shapes import Bump, smooth
-from palpate_assessment.standard import PressStandard
+from palpate_assessment.standard import Observations, PressStandard
 from palpate_models.numerics.frames import Array
 
 

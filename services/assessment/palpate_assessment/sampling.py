@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.checkpoint import FELT
+from palpate_models.scenario.load import FELT
 
 TRAVEL = 0.005
 """Travel that one sample averages [m]: a third of the radius in which the indenter feels, so it blurs little."""

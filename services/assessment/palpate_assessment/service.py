@@ -18,8 +18,7 @@ from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
-from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.load import Checkpoint, exam_input, read_checkpoint
 from palpate_models.scenario.schema import MOTION_NOTICED_S, ExamInput, Following, Scenario
 from palpate_models.section import quadrant
 

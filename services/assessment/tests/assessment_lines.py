@@ -6,10 +6,9 @@ import numpy as np
 
 from palpate_assessment.assess import MapGrid, map_grid
 from palpate_assessment.model import Regression, prior_log_amplitudes
-from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump
-from palpate_assessment.standard import USUAL, load_calibration
+from palpate_assessment.standard import USUAL, Observations, load_calibration, observe
 
 REGION = 0.14
 SPACING, ALONG, SPEED = 0.0125, 0.005, 0.03

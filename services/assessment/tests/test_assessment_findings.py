@@ -9,10 +9,9 @@ from assessment_lines import LEVEL, UP, flat_grid, level, lines, lump, natural, 
 from palpate_assessment.assess import AssessedMap, assess, assess_growing, causes, map_grid, marked_share
 from palpate_assessment.detection import Candidate, Signs, find_disc, limit_strength, match_bumps, signs
 from palpate_assessment.model import Regression, fit_log_amplitudes
-from palpate_assessment.observations import Observations
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump, ridge
-from palpate_assessment.standard import LENGTHS, PressStandard, load_calibration
+from palpate_assessment.standard import LENGTHS, Observations, PressStandard, load_calibration
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.codes import FindingKind
 from palpate_models.scenario.schema import Marked

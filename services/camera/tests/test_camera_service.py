@@ -9,7 +9,7 @@ import trimesh
 from palpate_bus.messages import MS, CameraTrigger, TFMessage, header, nanoseconds
 from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.testing import HandInbox
-from palpate_camera.backends.kinect import errors as kinect
+from palpate_camera.backends.kinect import service as kinect
 from palpate_camera.backends.kinect.scene import Mesh, Scene, View
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
 from palpate_camera.messages import Pinhole

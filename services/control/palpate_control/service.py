@@ -11,8 +11,7 @@ from palpate_bus.messages import MS, NS, JointTorqueCommand, Message, RobotStatu
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
-from palpate_control.admittance import AdmittanceController
-from palpate_control.impedance import ImpedanceController
+from palpate_control.impedance import AdmittanceController, ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array

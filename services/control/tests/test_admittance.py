@@ -9,7 +9,7 @@ from control_plant import WORKING, reference, setpoint
 
 from palpate_bus.messages import MS
 from palpate_bus.setpoint import ControlMode
-from palpate_control.admittance import TUNING, AdmittanceController
+from palpate_control.impedance import ADMITTANCE, AdmittanceController
 from palpate_control.model import ArmModel
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
@@ -21,7 +21,7 @@ ZONE = 0.05, 0.01
 """Limit zone [rad] and time between readings [s]."""
 BIAS = np.array((1.5, -2.0, 3.0))
 PUSH = np.array((0.0, 0.0, 10.0))
-SETTLED = round(8 * TUNING.yield_s * 1e3)
+SETTLED = round(8 * ADMITTANCE.yield_s * 1e3)
 
 
 class Contact:
@@ -86,7 +86,7 @@ def test_it_yields_no_further_than_its_limit() -> None:
     start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)
     R_WD = contact.tool()[1]
     far_D = R_WD.T @ (contact.follow(ControlMode.CARTESIAN, 100 * PUSH) - start)
-    assert np.abs(far_D).max() == pytest.approx(TUNING.yield_max_m, abs=1e-3)
+    assert np.abs(far_D).max() == pytest.approx(ADMITTANCE.yield_max_m, abs=1e-3)
 
 
 @pytest.mark.parametrize("mode", list(ControlMode))
@@ -97,7 +97,7 @@ def test_no_set_point_turns_a_joint_faster_or_further_than_it_may(mode: ControlM
         before = contact.q
         contact.follow(mode, np.zeros(3), 1, q=far, p_WD=np.array((2.0, 0.0, 2.0)))
         slower, rate = rate, (contact.q - before) * 1e3
-        assert (np.abs(rate) <= 1.001 * TUNING.speed_share * contact.model.velocity_limit).all()
+        assert (np.abs(rate) <= 1.001 * ADMITTANCE.speed_share * contact.model.velocity_limit).all()
         assert (rate - slower <= 1.001e-3 * lbr.ARM.acceleration_radps2).all()
     assert (np.abs(contact.q) <= contact.model.position_upper).all()
 
@@ -107,7 +107,7 @@ def test_a_far_posture_is_approached_slowly() -> None:
     contact.follow(ControlMode.JOINT, np.zeros(3), 20)
     before, self_motion = contact.q, np.linalg.svd(contact.model.J_W)[2][-1]
     contact.follow(ControlMode.CARTESIAN, np.zeros(3), 100, q=contact.asked + 2.0 * self_motion)
-    assert 0.01 < np.linalg.norm(contact.q - before) < 0.105 * TUNING.posture_radps
+    assert 0.01 < np.linalg.norm(contact.q - before) < 0.105 * ADMITTANCE.posture_radps
 
 
 @pytest.mark.parametrize("beside_m", [-0.01, 0.01])
@@ -166,4 +166,4 @@ def test_after_a_reset_it_starts_where_the_arm_is() -> None:
     contact.q = WORKING[1] + 0.2
     before = contact.q
     contact.follow(ControlMode.JOINT, np.zeros(3), 1)
-    assert (np.abs(contact.q - before) <= 1.001e-3 * TUNING.speed_share * contact.model.velocity_limit).all()
+    assert (np.abs(contact.q - before) <= 1.001e-3 * ADMITTANCE.speed_share * contact.model.velocity_limit).all()

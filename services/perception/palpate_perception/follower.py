@@ -15,8 +15,7 @@ import numpy as np
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
-from palpate_models.robot.arm import capsules, link_transforms
-from palpate_models.robot.table import TABLE
+from palpate_models.robot.arm import TABLE, capsules, link_transforms
 from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall
 from palpate_perception.cloud import Image, Intrinsics, RegionBox

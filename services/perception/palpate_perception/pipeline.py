@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation
 
 from palpate_bus.messages.codes import ViewReason
 from palpate_models.numerics.frames import Array, Mask, Unsigned, apply, inverse
-from palpate_models.robot.table import TABLE
+from palpate_models.robot.arm import TABLE
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface

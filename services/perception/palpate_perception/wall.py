@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from palpate_models.numerics.frames import Array, Indices, Mask, apply, inverse
-from palpate_models.robot.table import TABLE
+from palpate_models.robot.arm import TABLE
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
 from palpate_perception.cloud import CROP, Image, Intrinsics, RegionBox

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 from palpate_bus.messages.codes import ViewReason
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
-from palpate_perception import cloud, visibility
+from palpate_perception import cloud, pipeline
 from palpate_perception.cloud import Cloud, DepthFusion, RegionBox, frame_sigma
 from palpate_perception.pipeline import PIPELINE, Gaps
 from palpate_perception.surface import TUNING, fit
@@ -99,12 +99,12 @@ def flat_depth(z: float = 0.0) -> np.ndarray:
 
 
 def all_cells() -> np.ndarray:
-    xy, _ = visibility.cells(EXAM)
+    xy, _ = pipeline.cells(EXAM)
     return np.column_stack((xy, np.zeros(len(xy))))
 
 
 def gaps(missing: np.ndarray, depth: np.ndarray) -> Gaps:
-    return visibility.gaps(missing, len(all_cells()), X_CA, K, depth, (0, 0), SEEN_SHAPE)
+    return pipeline.gaps(missing, len(all_cells()), X_CA, K, depth, (0, 0), SEEN_SHAPE)
 
 
 @pytest.mark.parametrize(

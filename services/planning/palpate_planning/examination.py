@@ -10,9 +10,10 @@ import numpy as np
 from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.scenario.checkpoint import Checkpoint
+from palpate_models.scenario.load import Checkpoint
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactSensing
+from palpate_planning.course import OVER, PALPATING, PHASE_OF, ExamCourse, ExamStep, Observation, Stops
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, at_posture
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, RestartRamp
@@ -35,8 +36,6 @@ from palpate_planning.reasons import (
     count_causes,
 )
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
-from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation
-from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures, nearest_targets
@@ -417,9 +416,8 @@ class ExaminationSequence:
 
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
         """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
-        assert now.reading is not None
         course, remainder, cause = self._course, self._remainder, palpation.recovery.early_end
-        course.arm.hold(now.reading.q)
+        course.arm.hold(course.contact.q)
         self._requested.drop_plan()
         more = not palpation.recovery.failed and (palpation.more or bool(palpation.ahead))
         wanted = None if palpation.more else palpation.ahead

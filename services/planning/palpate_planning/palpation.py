@@ -195,27 +195,21 @@ class Palpation:
     def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:
         """Advance one planning period, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`.
 
-        Each part needs those before it: an interruption replaces the stages, the stages set the target of the motion, the depth
-        is regulated towards it, and the report shows the result.
+        Each part needs those before it: an interruption replaces the stages, and each check sees what those before it have
+        begun; the stages set the target of the motion, the depth is regulated towards it, and the report shows the result.
         """
-        self._correct(contact)
-        self._check_interruptions(t, contact)
-        self._resume_stages(t, contact, rate)
-        self._regulate(contact)
-        return self._report(t, contact, rate)
-
-    def _correct(self, contact: ContactMeasurement) -> None:
-        """Return towards the path, and refit the latest touch unless samples are taken."""
         self.recovery.return_to_path(contact)
-        if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
+        if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):  # no samples are taken
             self.descent.revise()
-
-    def _check_interruptions(self, t: int, contact: ContactMeasurement) -> None:
-        """Replace the stages where something interrupts them; each check sees what those before it have begun."""
         self._check_force(contact)
         self._check_elbow(contact)
         self._check_wall(t, contact)
         self._check_waits()
+        self._resume_stages(t, contact, rate)
+        in_contact = contact.touching and self.stage is not StrokeStage.LIFT
+        pushing = self.stage in stroke.PUSHING and not (self.recovery.paused or self.recovery.ending)
+        self._motion.regulate(contact, in_contact=in_contact, pushing=pushing)
+        return self._report(t, contact, rate)
 
     def _resume_stages(self, t: int, contact: ContactMeasurement, rate: float) -> None:
         """Resume the stages for one period, in which they may tare the sensor or find the touch."""
@@ -238,12 +232,6 @@ class Palpation:
         self._felt.append(self._motion.target if measuring else None)
         if measuring or (descent.touched and only_touched):
             self.waits.reach(self._number, self._motion.along.position, at_depth=not only_touched)
-
-    def _regulate(self, contact: ContactMeasurement) -> None:
-        """Regulate the depth towards the target of the stage."""
-        in_contact = contact.touching and self.stage is not StrokeStage.LIFT
-        pushing = self.stage in stroke.PUSHING and not (self.recovery.paused or self.recovery.ending)
-        self._motion.regulate(contact, in_contact=in_contact, pushing=pushing)
 
     # --- the sequence -------------------------------------------------------------------------------------------------
 

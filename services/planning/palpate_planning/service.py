@@ -31,17 +31,16 @@ from palpate_bus.setpoint import TOPIC
 from palpate_bus.settings import Settings
 from palpate_errors import restate
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
-from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.load import Checkpoint, exam_input, read_checkpoint
 from palpate_models.scenario.schema import ExamInput, Following, Scenario
 from palpate_planning.contact import ContactMeasurement, SensorReading
+from palpate_planning.course import NO_STOP, ArmStop, ExamStatus, Observation
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.reasons import NO_CAUSE, Cause
-from palpate_planning.status import NO_STOP, ArmStop, ExamStatus, Observation
 from palpate_planning.strokes.plan import PerceivedAbdomen, PressRequest
 from palpate_planning.wall.surface import PerceivedSurface
-from palpate_planning.wall.wall import HIDDEN_M, BreathObservation, PublishedTouch
+from palpate_planning.wall.wall import HIDDEN_M, BreathObservation
 
 COINCIDENT_M = 1e-4
 """Consecutive targets closer than this have no path between them."""
@@ -65,22 +64,6 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
         wall_displacement=0.0 if contact is None else contact.wall.displacement,
         **fields,
     )
-
-
-def touch_message(t: int, touch: PublishedTouch) -> Message:
-    """Return `palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
-    point = point_message(touch.p_W)
-    return SkinTouch(header(t, "world"), point, touch.stroke, touch.height, touch.sigma, touch.expected, touch.expected_sigma)
-
-
-def correction_message(t: int, outward: Array, sigma: Array) -> Message:
-    """Return the `palpation_msgs/SurfaceCorrection` at `t` [ns]: outward offset and its SD [m] at each vertex, shapes (n,)."""
-    return SurfaceCorrection(header(t, "abdomen"), outward.astype(np.float32), sigma.astype(np.float32))
-
-
-def path_message(t: int, poses_WI: Array) -> Message:
-    """Return the `nav_msgs/Path` at `t` [ns] of indenter poses X_WI, shape (n, 4, 4)."""
-    return Path(header(t, "world"), [PoseStamped(header(t, "world"), pose_message(X[:3, :3], X[:3, 3])) for X in poses_WI])
 
 
 def abdomen_of(mesh: Message, targets: Message, X_WA: Array) -> PerceivedAbdomen:
@@ -184,6 +167,7 @@ class PlanningService(Service):
         )
         if step.contact is not None and step.contact.touching:
             self._peak_force = max(self._peak_force, step.contact.load)
+        world = header(t, "world")
         outbox: dict[str, Message | list[Message]] = {}
         if self._lockstep or step.contact is not None:  # before the first reading, an arm of positions would move to a set-point
             outbox["planning/setpoint"] = step.setpoint.message()
@@ -191,11 +175,11 @@ class PlanningService(Service):
         if step.trigger:
             outbox["planning/camera_trigger"] = CameraTrigger(header(t), self._known.camera.frames)
         if step.touched is not None:
-            outbox["exam/touches"] = touch_message(t, step.touched)
+            outbox["exam/touches"] = SkinTouch(world, point_message(step.touched.p_W), *step.touched[1:])
         if step.correction is not None:
-            outbox["exam/correction"] = correction_message(t, *step.correction)
+            outbox["exam/correction"] = SurfaceCorrection(header(t, "abdomen"), *(x.astype(np.float32) for x in step.correction))
         if step.path is not None:
-            outbox["planning/path"] = path_message(t, step.path)
+            outbox["planning/path"] = Path(world, [PoseStamped(world, pose_message(X[:3, :3], X[:3, 3])) for X in step.path])
         return outbox
 
     def finish(self) -> Mapping[str, Any]:

@@ -19,12 +19,12 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings, ExamInput, Robot, Scenario
 from palpate_planning import examination
 from palpate_planning.contact import SensorReading
+from palpate_planning.course import ArmStop, ExamStatus, ExamStep, Observation
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
-from palpate_planning.status import ArmStop, ExamStatus, ExamStep, Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 from palpate_planning.wall.surface import PerceivedSurface

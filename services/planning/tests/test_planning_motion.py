@@ -21,7 +21,7 @@ from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot, arm_path
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion
-from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics, CollisionScene
 from palpate_planning.motion.planner import (
     TIMING,
     JerkLimitedAxis,
@@ -32,7 +32,6 @@ from palpate_planning.motion.planner import (
     plan,
     round_corners,
 )
-from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import MOVED, WAIT, Tally

@@ -18,9 +18,9 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Scenario
+from palpate_planning.course import ExamStep
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.service import PlanningService, create
-from palpate_planning.status import ExamStep
 from palpate_planning.strokes.plan import PerceivedAbdomen
 
 HOME = np.array(lbr.HOME)

@@ -10,7 +10,8 @@ from planning_fakes import BASE, FRAME, PERIOD_S, RATES, SMALL, World, check_at_
 
 from palpate_bus.messages.codes import Phase, Reason
 from palpate_models.scenario.schema import ExamInput, Following
-from palpate_planning import examination, presses as requested, waits
+from palpate_planning import examination, presses as requested, reasons
+from palpate_planning.course import Observation
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import BackgroundTask
 from palpate_planning.interruptions import WALL, WallWatch
@@ -28,7 +29,6 @@ from palpate_planning.reasons import (
     StrokeWaits,
     Tally,
 )
-from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PressRequest
 from palpate_planning.wall.wall import Breath, BreathObservation
@@ -75,7 +75,7 @@ class Watched(World):
 def limit_s(monkeypatch: pytest.MonkeyPatch) -> float:
     """Make the waits of strokes end early, to save time; return the limit."""
     short = WAIT._replace(limit_s=8.0)
-    monkeypatch.setattr(waits, "WAIT", short)
+    monkeypatch.setattr(reasons, "WAIT", short)
     return short.limit_s
 
 

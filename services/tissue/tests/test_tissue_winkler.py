@@ -14,8 +14,7 @@ from palpate_models.patient.motion import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Background, Lesion, Phantom, Stiffness
 from palpate_models.patient.wall import MEDIAN, MOST_STIFFENING, Guarding, stress
-from palpate_tissue.backends.winkler.implicit import ImplicitTissue
-from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS, STEP_LIMIT, assemble
+from palpate_tissue.backends.winkler.implicit import MOST_SUBSTEPS, STEP_LIMIT, ImplicitTissue, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue, move_freely
 from palpate_tissue.contact import RIM, Push, Sphere, add_friction, skin
 from palpate_validation.energy import closed_path, run_cycle
@@ -100,14 +99,14 @@ def test_fine_mesh_is_sub_stepped_and_would_blow_up_without(monkeypatch):
     tissue = WinklerTissue(model, ELASTIC)
     assert tissue.substeps > 1
     assert worst_growth(tissue) < 1
-    monkeypatch.setattr("palpate_tissue.backends.winkler.mechanics.Mechanics.substeps", lambda self, dt: 1)
+    monkeypatch.setattr("palpate_tissue.backends.winkler.implicit.Mechanics.substeps", lambda self, dt: 1)
     assert worst_growth(WinklerTissue(model, ELASTIC)) > 1e3
 
 
 def test_sub_stepping_gives_the_same_force(monkeypatch):
     model = flat_phantom(0.06)
     one = hold(WinklerTissue(model, Stiffness()), 0.008)
-    monkeypatch.setattr("palpate_tissue.backends.winkler.mechanics.Mechanics.substeps", lambda self, dt: 4)
+    monkeypatch.setattr("palpate_tissue.backends.winkler.implicit.Mechanics.substeps", lambda self, dt: 4)
     np.testing.assert_allclose(hold(WinklerTissue(model, Stiffness()), 0.008), one, rtol=2e-3, atol=2e-3)
 
 

@@ -18,8 +18,7 @@ from ompl import base, geometric, util
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, path_length
 from palpate_models.scenario.schema import Limits
-from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.scene import COLLISION, CollisionScene
+from palpate_planning.motion.kinematics import COLLISION, ArmKinematics, CollisionScene
 from palpate_planning.periods import MS
 
 

@@ -16,9 +16,8 @@ from palpate_bus.messages.codes import Reason
 from palpate_models.numerics.frames import Array, Ints, apply, inverse, rigid
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics, CollisionScene, ViewPyramid, region_corners
 from palpate_planning.motion.planner import JointTrajectory, NoPathError, timed_motion
-from palpate_planning.motion.scene import CollisionScene, ViewPyramid, region_corners
 from palpate_planning.placement.redundancy import plan_redundancy, prepare
 from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.strokes.coverage import Stroke, strokes, touches, transfer

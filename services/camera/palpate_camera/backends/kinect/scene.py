@@ -24,7 +24,7 @@ import trimesh
 from palpate_camera.messages import Pinhole
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, Array32, Mask, Unsigned, apply, inverse
-from palpate_models.robot import table
+from palpate_models.robot.arm import boxes
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
 
@@ -183,7 +183,7 @@ def furniture(robot: Robot) -> Mesh:
     """Table and robot base, in world."""
     return merge(
         Mesh(apply(box.X_WB, np.asarray(shape.vertices, np.float64)), shape.faces.astype(np.uint32))
-        for box in table.boxes(robot)
+        for box in boxes(robot)
         for shape in (trimesh.creation.box(box.size),)
     )
 

@@ -23,9 +23,8 @@ import numpy as np
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import GRAVITY, Array, rigid
-from palpate_models.robot.arm import arm_of, capsules, count_mounted, link_names, urdf
+from palpate_models.robot.arm import Box, arm_of, boxes, capsules, count_mounted, link_names, urdf
 from palpate_models.robot.chain import Capsule
-from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.kinematics import Kinematics

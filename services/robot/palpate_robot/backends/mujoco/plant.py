@@ -20,9 +20,8 @@ import mujoco
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import TOOL, arm_of, base_pose, capsules, count_mounted, inertias, link_names
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, boxes, capsules, count_mounted, inertias, link_names
 from palpate_models.robot.chain import Capsule, Inertia
-from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant, Wrench

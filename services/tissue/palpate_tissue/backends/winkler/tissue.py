@@ -28,8 +28,7 @@ from palpate_models.patient.motion import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backend import SkinBody, TissueBackend
-from palpate_tissue.backends.winkler.implicit import ImplicitTissue
-from palpate_tissue.backends.winkler.mechanics import assemble
+from palpate_tissue.backends.winkler.implicit import ImplicitTissue, assemble
 from palpate_tissue.backends.winkler.presses import standard_presses
 from palpate_tissue.contact import NO_PUSH, Bristle, Near, Push, Sphere, add_friction, add_vertex, meet
 

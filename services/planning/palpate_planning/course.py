@@ -1,16 +1,115 @@
-"""Stop, hold and resume: how an examination that is stopped continues or ends."""
+"""The course of an examination: inputs and outputs of a step, its phases, and how one that is stopped continues or ends."""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_planning.contact import ContactMeasurement
+from palpate_planning.contact import ContactMeasurement, SensorReading
 from palpate_planning.free_motion import FreeMotion
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause
-from palpate_planning.status import OVER, PALPATING, ExamStatus, Observation
-from palpate_planning.strokes.plan import ExamPlan, PerceivedAbdomen
+from palpate_planning.setpoints import AT_REST
+from palpate_planning.stroke import StrokeStage
+from palpate_planning.strokes.plan import ExamPlan, PerceivedAbdomen, PressRequest
+from palpate_planning.wall.wall import BreathObservation, PublishedTouch
+
+PHASE_OF: Final = {
+    **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),
+    **dict.fromkeys((StrokeStage.SLIDE, StrokeStage.HOLD), Phase.SCAN),
+    **dict.fromkeys((StrokeStage.LIFT, StrokeStage.TRANSFER, StrokeStage.WAIT, StrokeStage.DONE), Phase.RETRACT),
+}
+"""The phase to which each stage of a stroke belongs."""
+PALPATING: Final = frozenset(PHASE_OF.values())
+"""Phases in which the strokes of the plan are carried out."""
+OVER: Final = frozenset({Phase.DONE, Phase.ABORTED})
+"""Phases that end the examination."""
+
+
+class ArmStop(NamedTuple):
+    """A stop of the arm. False if there is none."""
+
+    cause: Cause = NO_CAUSE
+    planning_retreats: bool = False
+    """True if planning moves the arm, back along the normal; else the driver holds it."""
+    final: bool = False
+    """True if no release ends it."""
+
+    def __bool__(self) -> bool:
+        return bool(self.cause)
+
+
+NO_STOP: Final = ArmStop()
+
+
+class Observation(NamedTuple):
+    """Inputs of one step. A message appears only in the step in which it arrived."""
+
+    t: int
+    """Time [ns]."""
+    reading: SensorReading | None
+    """None before the first `robot/status`."""
+    perceived: PerceivedAbdomen | Cause | None = None
+    """Perception's answer, if it arrived."""
+    motion: BreathObservation | None = None
+    """The newest motion of the wall, if it arrived."""
+    findings_final: bool = False
+    """True if the final findings of the assessment arrived."""
+    stop: ArmStop = NO_STOP
+    end: Cause = NO_CAUSE
+    """Cause for which the examination is to go home and end, if that was just requested."""
+    lost: Cause = NO_CAUSE
+    """Cause if needed roles are disconnected."""
+    request: PressRequest | None = None
+    """The request of the search, if it arrived."""
+    averaged: Array | None = None
+    """Height of the wall above the surface's vertices in the mean of later images [m], if it arrived."""
+    joint_force: float = 0.0
+    """Force at the tool by the joints alone [N]."""
+
+
+@dataclass
+class ExamStatus:
+    """Fields of exam/state other than the measured contact, by their names there."""
+
+    phase: Phase = Phase.HOME
+    message: str = "waiting for the robot"
+    cause: Cause = NO_CAUSE
+    target_index: int = 0
+    target_count: int = 0
+    targets_skipped: int = 0
+    steady: bool = False
+    force_limited: bool = False
+    view_blocked: bool = False
+    depth_setpoint: float = 0.0
+    """Target depth [m], negative above the wall."""
+    end_tick: int = -1
+    """When the run is to end [ns]; -1 while undecided."""
+    stroke: int = 0
+    """Number of the latest descent, 0 before the first."""
+    patient_moved: bool = False
+    """True if the patient has moved since the surface was perceived."""
+
+
+@dataclass(slots=True)
+class ExamStep:
+    """Outputs of one step."""
+
+    contact: ContactMeasurement | None
+    """None before the first reading of the robot."""
+    setpoint: Setpoint = AT_REST
+    trigger: bool = False
+    """Ask the camera for a burst now."""
+    path: Array | None = None
+    """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
+    touched: PublishedTouch | None = None
+    """The touch of this step, if there was one."""
+    correction: tuple[Array, Array] | None = None
+    """Correction of the perceived surface's vertices, from `Wall.heights_above`, once: when the strokes are over."""
+
 
 END_AFTER = SECOND
 """The run continues for this time after the examination has ended [ns]."""
@@ -51,16 +150,14 @@ class ExamCourse:
 
     def abort(self, now: Observation, cause: Cause) -> None:
         """End the examination where the arm is; it holds still."""
-        assert now.reading is not None
-        self.arm.hold(now.reading.q)
+        self.arm.hold(self.contact.q)
         phase = self.interrupted if self.phase is Phase.HELD else self.phase
         self.enter(Phase.ABORTED, now.t, f"aborted in phase {phase.name}: {cause.text}", cause)
 
     def go_home(self, now: Observation, cause: Cause = NO_CAUSE) -> None:
         """Return home from where the arm is; the examination is then aborted if there is a cause."""
-        assert now.reading is not None
         self.failure = cause
-        self.arm.hold(now.reading.q)
+        self.arm.hold(self.contact.q)
         self.enter(Phase.RETURN, now.t, f"returning home: {cause.text}" if cause else "returning home", cause)
 
 
@@ -112,21 +209,19 @@ class Stops:
             text = f"the stop was not released within {self._patience_s:g} s of waiting: {now.stop.cause.text}"
             course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.cause.culprit))
         elif not self._soft:
-            assert now.reading is not None
-            course.arm.hold(now.reading.q)
+            course.arm.hold(course.contact.q)
         elif (palpation := self._palpation) is not None and palpation.free_goal is None:
             return palpation.step(now.t, course.contact, course.rate).setpoint
         return None
 
     def _hold(self, now: Observation) -> None:
         """Let the strokes retreat, or leave the arm to the driver."""
-        assert now.reading is not None
         course = self._course
         self._soft, self._resuming = now.stop.planning_retreats, False
         place = (course.status.stroke, None if course.interrupted in PALPATING else course.interrupted)
         self._stopped_ns = self._stopped_ns if place == self._place else 0
         self._place, self._counted = place, now.t
-        course.arm.hold(now.reading.q)
+        course.arm.hold(course.contact.q)
         cause = now.stop.cause
         course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {cause.text}", cause)
         if (palpation := self._palpation) is not None:
@@ -136,8 +231,7 @@ class Stops:
         """Return to the interrupted phase; a free motion is planned again."""
         course, palpation = self._course, self._palpation
         if not (self._soft or self._resuming):  # it may have been moved by hand since the latest measurement in the stop
-            assert now.reading is not None
-            course.arm.hold(now.reading.q)
+            course.arm.hold(course.contact.q)
         self._resuming = True
         goal = self._free_goal(palpation)
         if goal is not None:
