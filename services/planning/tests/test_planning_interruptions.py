@@ -14,6 +14,7 @@ from palpate_bus.messages.codes import Phase, Reason
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.robot import lbr
 from palpate_planning.contact import SensorReading
+from palpate_planning.course import Observation
 from palpate_planning.interruptions import RECOVERY, Recovery
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import JointTrajectory
@@ -21,7 +22,6 @@ from palpate_planning.palpation import NOT_TRACKED, Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import NO_CAUSE, Cause, Tally
 from palpate_planning.setpoints import ReturnToArm, joint_setpoint
-from palpate_planning.status import Observation
 from palpate_planning.stroke import StrokeStage
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
