@@ -72,7 +72,7 @@ def assert_undisturbed(outcome: RunResult) -> None:
 def test_every_placement_gives_the_run_hash_of_the_composed_run_and_the_first_diagnostics_include_who_joined_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("palpate_conductor.watchdog.TUNING", ContractWatchTuning(poll_s=3600.0))
+    monkeypatch.setattr("palpate_conductor.watchdog.WATCHING", ContractWatchTuning(poll_s=3600.0))
     first: list[DiagnosticStatus] = []
 
     def keep(running: Running) -> None:

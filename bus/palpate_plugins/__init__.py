@@ -169,7 +169,7 @@ def _import_from(folder: Path) -> None:
     """
     sys.path[:] = [str(folder), *(entry for entry in sys.path if entry != str(folder))]
     names = {path.stem for path in folder.iterdir()}
-    for name in [name for name in sys.modules if name.partition(".")[0] in names]:
+    for name in [name for name in tuple(sys.modules) if name.partition(".")[0] in names]:
         if any(name.partition(".")[0] not in before and _comes_from(name, user) for user, before in _FOLDERS.items()):
             del sys.modules[name]
     _FOLDERS.setdefault(folder, frozenset(sys.modules))
