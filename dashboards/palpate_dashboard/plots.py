@@ -1,12 +1,12 @@
 """Plots, states and log next to the scene, and force over depth. Numbers in, rerun entities out.
 
 Force over depth is drawn in a 2-D view, because rerun's plots only have time on the x axis. Its x is depth [mm] and its y
-is minus force [N], as image axes point down, both times `STRETCH`.
+is minus force [N], as image axes point down, both times `PLOT.stretch`.
 """
 
 from collections.abc import Mapping
 from itertools import cycle, islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -16,11 +16,18 @@ from palpate_dashboard import palette
 from palpate_dashboard.sinks import Canvas, scalars
 from palpate_dashboard.text import LEVELS, Health
 
-STRETCH: Final = 10.0
-FLUSH: Final = 20
-"""Samples per piece of the curve: one second."""
-DEPTH_FLOOR_M: Final = -0.02
-"""The depth plot is blank further above the surface than this: free motion would flatten the contact to a line."""
+
+class PlotTuning(NamedTuple):
+    """Scale and detail of the plots."""
+
+    stretch: float = 10.0
+    flush: int = 20
+    """Samples per piece of the curve: one second."""
+    depth_floor_m: float = -0.02
+    """The depth plot is blank further above the surface than this: free motion would flatten the contact to a line."""
+
+
+PLOT: Final = PlotTuning()
 _AXIS: Final = (150, 150, 150, 255)
 
 
@@ -32,7 +39,7 @@ class ForceDepthPlane:
         self.wanted_mm = 1e3 * depth_m
         self.depth_max_mm = max(2.0 * self.wanted_mm, 10.0)
         self.force_max_n = force_limit_n
-        self.size = (STRETCH * self.depth_max_mm, STRETCH * self.force_max_n)
+        self.size = (PLOT.stretch * self.depth_max_mm, PLOT.stretch * self.force_max_n)
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -51,22 +58,22 @@ class ForceDepth:
         x, y = plane.size
         lines = [[(0, 0), (x, 0)], [(0, 0), (0, -y)]]
         depths, forces = np.arange(0, plane.depth_max_mm + 0.1, 5.0), np.arange(0, plane.force_max_n + 0.1, 5.0)
-        lines += [[(STRETCH * d, 0), (STRETCH * d, 0.02 * y)] for d in depths]
-        lines += [[(0, -STRETCH * f), (-0.015 * x, -STRETCH * f)] for f in forces]
+        lines += [[(PLOT.stretch * d, 0), (PLOT.stretch * d, 0.02 * y)] for d in depths]
+        lines += [[(0, -PLOT.stretch * f), (-0.015 * x, -PLOT.stretch * f)] for f in forces]
         canvas.log("force_depth/axes", rr.LineStrips2D(lines, colors=[_AXIS], radii=[rr.Radius.ui_points(0.7)]))
-        places = [(STRETCH * d, 0.06 * y) for d in depths] + [(-0.06 * x, -STRETCH * f) for f in forces[1:]]
+        places = [(PLOT.stretch * d, 0.06 * y) for d in depths] + [(-0.06 * x, -PLOT.stretch * f) for f in forces[1:]]
         words = [f"{d:.0f} mm" for d in depths] + [f"{f:.0f} N" for f in forces[1:]]
         marks = rr.Points2D(places, labels=words, colors=[_AXIS], radii=[0.01], show_labels=True)
         canvas.log("force_depth/axes/ticks", marks)
-        wanted = [[(STRETCH * plane.wanted_mm, 0), (STRETCH * plane.wanted_mm, -y)]]
+        wanted = [[(PLOT.stretch * plane.wanted_mm, 0), (PLOT.stretch * plane.wanted_mm, -y)]]
         guide = rr.LineStrips2D(wanted, colors=[(230, 230, 230, 120)], radii=[rr.Radius.ui_points(0.5)])
         canvas.log("force_depth/wanted_depth", guide)
 
     def add(self, t: int, depth_m: float, force_n: float) -> None:
         """Add a sample in contact at simulated time `t` [ns]. The latest piece is drawn as a line, earlier ones as dots."""
-        self._past.append((STRETCH * 1e3 * depth_m, -STRETCH * force_n))
+        self._past.append((PLOT.stretch * 1e3 * depth_m, -PLOT.stretch * force_n))
         self._new += 1
-        if self._new < FLUSH:
+        if self._new < PLOT.flush:
             return
         bright = rr.LineStrips2D([self._past[-self._new - 1 :]], colors=[palette.FORCE], radii=[rr.Radius.ui_points(1.5)])
         self._canvas.log("force_depth/now", bright, t)
@@ -124,7 +131,7 @@ SERIES: Final[Mapping[str, tuple[str, tuple[int, int, int], float]]] = {
 
 def depth_mm(depth_m: float) -> float:
     """Return a depth for its plot [mm]; NaN in free motion."""
-    return 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else float("nan")
+    return 1e3 * depth_m if depth_m > PLOT.depth_floor_m else float("nan")
 
 
 class Plots:

@@ -6,7 +6,7 @@ It sends nothing, so it cannot change a run. Late messages are skipped.
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +30,27 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 
 FILE: Final = "recording.rrd"
-MESH_NS: Final = 100 * MS
-PLOT_NS: Final = 50 * MS
-TEXT_NS: Final = 500 * MS
-IMAGE_NS: Final = 500 * MS
-MAP_NS: Final = 1000 * MS
-SPARSE_NS: Final = 2000 * MS
-"""Period of meshes and images in a sparse recording."""
-POSE_NS: Final = 100 * MS
-"""Period of link poses in a sparse recording."""
-SEND_NS: Final = 1000 * MS
-"""Simulated time per chunk of the file."""
-SEND_LIVE_NS: Final = 200 * MS
-"""Simulated time per chunk with a live viewer."""
+
+
+class ViewPeriods(NamedTuple):
+    """Periods of what is drawn [ns], simulated."""
+
+    mesh_ns: int = 100 * MS
+    plot_ns: int = 50 * MS
+    text_ns: int = 500 * MS
+    image_ns: int = 500 * MS
+    map_ns: int = 1000 * MS
+    sparse_ns: int = 2000 * MS
+    """Period of meshes and images in a sparse recording."""
+    pose_ns: int = 100 * MS
+    """Period of link poses in a sparse recording."""
+    send_ns: int = 1000 * MS
+    """Simulated time per chunk of the file."""
+    send_live_ns: int = 200 * MS
+    """Simulated time per chunk with a live viewer."""
+
+
+PERIODS = ViewPeriods()
 FORECAST_INDEX: Final = 4
 """The drawn forecast of the breathing motion: 0.2 s ahead, about what planning uses."""
 ABOVE_SKIN_M: Final = 0.002
@@ -72,7 +80,7 @@ class DashboardService(Service):
         run = "" if path is None else run_of(path.parent)
         self._canvas = Canvas(open_recording(path, live, layout, scenario.name, run))
         self._force_depth = ForceDepth(self._canvas, plane)
-        self._send_period = SEND_LIVE_NS if paced and live != Live() else SEND_NS
+        self._send_period = PERIODS.send_live_ns if paced and live != Live() else PERIODS.send_ns
         self._scene = scene = SceneView(self._canvas, given.robot, given.camera)
         self._map = MapView(self._canvas, exam.region_m, exam.centre_m)
         self._plots = Plots(self._canvas, text.LEGEND)
@@ -94,24 +102,24 @@ class DashboardService(Service):
         self._busy_s = 0.0
         often = full or live != Live()
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/surface", MESH_NS if often else SPARSE_NS, scene.abdomen),
+            ("sim/surface", PERIODS.mesh_ns if often else PERIODS.sparse_ns, scene.abdomen),
             ("truth/phantom", 0, self._phantom),
             ("tf_static", 0, scene.camera),
-            ("camera/depth/camera_info", IMAGE_NS, scene.lens),
-            ("camera/depth/image_raw", IMAGE_NS if often else SPARSE_NS, scene.depth),
-            ("perception/points", IMAGE_NS, scene.cloud),
-            ("perception/surface", IMAGE_NS, scene.perceived),
+            ("camera/depth/camera_info", PERIODS.image_ns, scene.lens),
+            ("camera/depth/image_raw", PERIODS.image_ns if often else PERIODS.sparse_ns, scene.depth),
+            ("perception/points", PERIODS.image_ns, scene.cloud),
+            ("perception/surface", PERIODS.image_ns, scene.perceived),
             ("perception/targets", 0, self._targets),
-            ("perception/motion", PLOT_NS, self._wall),
+            ("perception/motion", PERIODS.plot_ns, self._wall),
             ("planning/path", 0, scene.planned),
-            ("exam/state", PLOT_NS, self._exam),
-            ("truth/indentation", PLOT_NS, self._indentation),
-            ("truth/patient", PLOT_NS, self._patient),
-            ("sim/link_poses", PLOT_NS if often else POSE_NS, self._link_poses),
-            ("robot/status", PLOT_NS, self._robot_status),
-            ("assessment/map", MAP_NS, self._stiffness),
+            ("exam/state", PERIODS.plot_ns, self._exam),
+            ("truth/indentation", PERIODS.plot_ns, self._indentation),
+            ("truth/patient", PERIODS.plot_ns, self._patient),
+            ("sim/link_poses", PERIODS.plot_ns if often else PERIODS.pose_ns, self._link_poses),
+            ("robot/status", PERIODS.plot_ns, self._robot_status),
+            ("assessment/map", PERIODS.map_ns, self._stiffness),
             ("assessment/findings", 0, self._findings),
-            ("diagnostics", TEXT_NS, self._diagnostics),
+            ("diagnostics", PERIODS.text_ns, self._diagnostics),
         )
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -222,9 +230,9 @@ class DashboardService(Service):
             ("progress/targets", 100.0 * message.target_index / max(message.target_count, 1)),
         ):
             self._plots.add(t, path, value)
-        if not self._is_due("text", t, TEXT_NS):
+        if not self._is_due("text", t, PERIODS.text_ns):
             return
-        self._due["text"] = t + TEXT_NS
+        self._due["text"] = t + PERIODS.text_ns
         self._plots.document(t, "text/status", text.status(self._name, phase, message, self._robot, self._speed))
 
     def _indentation(self, t: int, message: Message) -> None:

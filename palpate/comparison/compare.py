@@ -30,20 +30,27 @@ from palpate.report.scoring import Map
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, Mask, apply, rigid
 
-SURFACE_M: Final = 0.001
-"""Distance of surfaces that counts as much as `log_force`."""
-LOG_FORCE: Final = 0.1
-SATURATION: Final = 3.0
-"""A disagreement, in those units, from which more counts little."""
-OVERLAP: Final = 0.5
-"""Minimum share of B's map on that of A: of a smaller one, what lacks counts as a complete disagreement."""
-NEAR_M: Final = 0.005
-"""Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
-SAME_DEPTH_M: Final = 0.0005
-"""Maps whose depths differ by more are compared with a message."""
-MIN_PLACES: Final = 10
-CONFIDENCE: Final = 0.9
-RESAMPLES: Final = 2000
+
+class CompareTuning(NamedTuple):
+    """Settings of the registration and the intervals."""
+
+    surface_m: float = 0.001
+    """Distance of surfaces that counts as much as `log_force`."""
+    log_force: float = 0.1
+    saturation: float = 3.0
+    """A disagreement, in those units, from which more counts little."""
+    overlap: float = 0.5
+    """Minimum share of B's map on that of A: of a smaller one, what lacks counts as a complete disagreement."""
+    near_m: float = 0.005
+    """Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
+    same_depth_m: float = 0.0005
+    """Maps whose depths differ by more are compared with a message."""
+    min_places: int = 10
+    confidence: float = 0.9
+    resamples: int = 2000
+
+
+TUNING: Final = CompareTuning()
 Interval = tuple[float, float]
 
 
@@ -89,7 +96,7 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
     if message is None:
         raise UserError(f"{path}: there is no map to compare: {faults[-1] if faults else 'its samples are too few'}")
     depth = float(message.common_depth)
-    if depth_m is not None and abs(depth - depth_m) > SAME_DEPTH_M:
+    if depth_m is not None and abs(depth - depth_m) > TUNING.same_depth_m:
         faults += (f"{path}: its map is at {1e3 * depth:.3g} mm, the other at {1e3 * depth_m:.3g} mm: level and bias include it",)
     return ComparedPalpation(path.stem if path.is_file() else path.name, map_of(message), depth, places, force, faults)
 
@@ -139,7 +146,7 @@ def compare(a: ComparedPalpation, b: ComparedPalpation, register: bool | None = 
     Raises UserError if they overlap at too few places.
     """
     X = np.eye(4)
-    wanted = _apart(a, b) > NEAR_M if register is None else register
+    wanted = _apart(a, b) > TUNING.near_m if register is None else register
     if wanted:
         X = _registration(a, b)
     moved = b.in_frame(X)
@@ -147,8 +154,8 @@ def compare(a: ComparedPalpation, b: ComparedPalpation, register: bool | None = 
     of_a, lower, upper = (_on(a, values)(xy) for values in (a.map.apparent, a.map.lower, a.map.upper))
     of_b = _on(moved, b.map.apparent)(xy)
     there = np.isfinite(of_a) & np.isfinite(of_b) & (b.force > 0)
-    if there.sum() < MIN_PLACES:
-        raise UserError(f"{a.name}, {b.name}: {there.sum()} places in common, at least {MIN_PLACES} are needed")
+    if there.sum() < TUNING.min_places:
+        raise UserError(f"{a.name}, {b.name}: {there.sum()} places in common, at least {TUNING.min_places} are needed")
     of_a, of_b, lower, upper, force = (values[there] for values in (of_a, of_b, lower, upper, b.force))
     ratio = np.log(of_b / of_a)
     level = float(np.exp(np.median(ratio)))
@@ -202,10 +209,10 @@ def _registration(a: ComparedPalpation, b: ComparedPalpation) -> Array:
         ratio = force(p[:, :2]) - felt
         both = np.isfinite(ratio)
         level = np.median(ratio[both]) if both.any() else 0.0
-        rows = np.concatenate(((height(p[:, :2]) - p[:, 2]) / SURFACE_M, (ratio - level) / LOG_FORCE))
+        rows = np.concatenate(((height(p[:, :2]) - p[:, 2]) / TUNING.surface_m, (ratio - level) / TUNING.log_force))
         there = np.isfinite(rows)
-        lacking = max(OVERLAP * len(rows) - there.sum(), 0.0)
-        costs = np.arctan(np.nan_to_num(rows, nan=0.0) / SATURATION)  # has a slope beyond it, where a clip has none
+        lacking = max(TUNING.overlap * len(rows) - there.sum(), 0.0)
+        costs = np.arctan(np.nan_to_num(rows, nan=0.0) / TUNING.saturation)  # has a slope beyond it, where a clip has none
         return np.asarray(np.append(costs, np.pi / 2 * np.sqrt(lacking)) / np.sqrt(there.sum() + lacking))
 
     motion = least_squares(misfit, start, x_scale=[0.002] * 3 + [0.05] * 3).x
@@ -217,7 +224,9 @@ def _interval(inside: Mask) -> Interval:
     """Return the bootstrap interval of a share over places."""
     if inside.all() or not inside.any():
         return float(inside.mean()), float(inside.mean())
-    found = bootstrap((inside,), np.mean, confidence_level=CONFIDENCE, n_resamples=RESAMPLES, method="percentile", rng=0)
+    found = bootstrap(
+        (inside,), np.mean, confidence_level=TUNING.confidence, n_resamples=TUNING.resamples, method="percentile", rng=0
+    )
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -32,15 +32,23 @@ _PHASE_TINTS: Final = {
     ExamState.PHASE_ASSESS: ("assess", "#dcfce7"),
     ExamState.PHASE_ABORTED: ("aborted", "#fecaca"),
 }
-FREE_MM: Final = -20.0
-"""Depth below which the tool is clear of the surface; not drawn."""
-MIN_DEPTH_MM: Final = -5.0
-"""Minimum depth in figures of the contact."""
-MAX_VERTICES: Final = 65_535
-"""The viewer's indices have 16 bits."""
-UNKNOWN_GREY: Final = 0.80
-AXIS_M: Final = 0.05
-"""Length of the axes of the abdomen frame."""
+
+
+class FigureTuning(NamedTuple):
+    """Ranges and limits of the figures."""
+
+    free_mm: float = -20.0
+    """Depth below which the tool is clear of the surface; not drawn."""
+    min_depth_mm: float = -5.0
+    """Minimum depth in figures of the contact."""
+    vertices: int = 65_535
+    """The viewer's indices have 16 bits."""
+    unknown_grey: float = 0.80
+    axis_m: float = 0.05
+    """Length of the axes of the abdomen frame."""
+
+
+SHOWN: Final = FigureTuning()
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -116,12 +124,12 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
         at = states.force_limited
         force.plot(states.time[at], states.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
     plain(force, "normal force [N]")
-    measured = np.where(states.depth * 1e3 > FREE_MM, states.depth * 1e3, np.nan)
-    wanted = np.where(states.setpoint * 1e3 > FREE_MM, states.setpoint * 1e3, np.nan)
+    measured = np.where(states.depth * 1e3 > SHOWN.free_mm, states.depth * 1e3, np.nan)
+    wanted = np.where(states.setpoint * 1e3 > SHOWN.free_mm, states.setpoint * 1e3, np.nan)
     depth.plot(states.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
     depth.plot(states.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
-    depth.set_ylim(MIN_DEPTH_MM, None)
+    depth.set_ylim(SHOWN.min_depth_mm, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     force.set_xlim(states.time[0], states.time[-1])
@@ -160,7 +168,7 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], d
     triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
     whole = mapped.scanned[triangles].all(axis=1)
     triangles = np.concatenate((triangles[whole], triangles[~whole]))
-    if not mapped.scanned.any() or len(mapped.vertices) > MAX_VERTICES:
+    if not mapped.scanned.any() or len(mapped.vertices) > SHOWN.vertices:
         return None
     middle = mapped.vertices[mapped.scanned].mean(axis=0)
     shape = mapped.vertices - middle
@@ -177,7 +185,7 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], d
 
     def add(name: str, positions: Array, values: Array, norm: Normalize, cmap: str, form: str, outlined: bool) -> None:
         scale = colormaps[cmap]
-        colors = np.where(known[:, None], scale(norm(values))[:, :3], UNKNOWN_GREY)
+        colors = np.where(known[:, None], scale(norm(values))[:, :3], SHOWN.unknown_grey)
         stops = [to_hex(scale(x)) for x in np.linspace(0, 1, 9)]
         ticks = [form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5)]
         shown = triangles if outlined else triangles[: whole.sum()]
@@ -219,8 +227,8 @@ def _labels(shape: Array, known: Mask, middle: Array, abdomen: bool) -> dict[str
 
     x, y, _ = 0.16 * max(right - left, head - feet) * np.eye(3)
     corner = on_surface(left, feet) - 0.3 * (x + y)
-    ends = corner + AXIS_M * np.eye(3)
-    words = {f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)}
+    ends = corner + SHOWN.axis_m * np.eye(3)
+    words = {f"{name} {1e3 * SHOWN.axis_m:.0f} mm": end for name, end in zip("xyz", ends, strict=True)}
     if abdomen:
         words |= {"head": on_surface(0.0, head) + y, "feet": on_surface(0.0, feet) - y}
         words |= {"patient's right": on_surface(left, 0.0) - x, "patient's left": on_surface(right, 0.0) + x}

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,17 +31,23 @@ def scan_safely(exam: Exam, surface: Surface) -> Scan:
     return run_guarded(part, lambda: scan_of(exam, surface), Settings.read().start_limit_s, PluginError)
 
 
-APPROACH_AND_RETURN_S: Final = 12.0
-"""Before the first descent and after the last."""
-TOUCH_S: Final = 2.7
-LINE_CHANGE_S: Final = 3.0
-"""Lift, transfer, touch and press between two lines."""
-POINT_S: Final = 2.8
-"""One point of a point-wise scan."""
-SEARCHED_PRESS_S: Final = 4.0
-"""One press of a search, which moves further."""
-TRANSFER_MPS: Final = 0.17
-"""Speed above the skin between two lines."""
+class ExamTiming(NamedTuple):
+    """Durations in simulated time."""
+
+    approach_and_return_s: float = 12.0
+    """Before the first descent and after the last."""
+    touch_s: float = 2.7
+    line_change_s: float = 3.0
+    """Lift, transfer, touch and press between two lines."""
+    point_s: float = 2.8
+    """One point of a point-wise scan."""
+    searched_press_s: float = 4.0
+    """One press of a search, which moves further."""
+    transfer_mps: float = 0.17
+    """Speed above the skin between two lines."""
+
+
+TIMING = ExamTiming()
 
 
 class Outlook(NamedTuple):
@@ -61,20 +67,20 @@ class Outlook(NamedTuple):
         scan = scan_safely(exam, _flat)
         touches = len(touch_centres(scan.targets))
         presses = exam.budget.presses if exam.searched else len(scan.targets)
-        duration = APPROACH_AND_RETURN_S + TOUCH_S * touches + _pressing_s(exam, scan)
+        duration = TIMING.approach_and_return_s + TIMING.touch_s * touches + _pressing_s(exam, scan)
         return Outlook(duration, touches, len(scan.lines), presses)
 
 
 def _pressing_s(exam: Exam, scan: Scan) -> float:
     if exam.searched:
-        return min(SEARCHED_PRESS_S * exam.budget.presses, exam.budget.seconds)
+        return min(TIMING.searched_press_s * exam.budget.presses, exam.budget.seconds)
     if exam.mode is Mode.POINT:
-        return POINT_S * len(scan.targets)
+        return TIMING.point_s * len(scan.targets)
     slide = sum(_length(line) for line in scan.lines)
     between = sum(_length(np.vstack((a[-1], b[0]))) for a, b in pairwise(scan.lines))
     if scan.joined:
-        return (slide + between) / exam.speed_mps + LINE_CHANGE_S
-    return slide / exam.speed_mps + between / TRANSFER_MPS + LINE_CHANGE_S * len(scan.lines)
+        return (slide + between) / exam.speed_mps + TIMING.line_change_s
+    return slide / exam.speed_mps + between / TIMING.transfer_mps + TIMING.line_change_s * len(scan.lines)
 
 
 def _length(points: Array) -> float:

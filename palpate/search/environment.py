@@ -8,13 +8,13 @@
     (30, 5)
 
 An episode is one patient and `presses` presses. The reward of a press is the decrease of the entropy of the posterior over
-"no lump, or one at this place" [nat], less `REWARD_PER_S` per second. The last press adds the logarithm of the probability of the
-truth (no lump, or one near its true place), at least `LEAST_REWARD`.
+"no lump, or one at this place" [nat], less `REWARD.per_s` per second. The last press adds the logarithm of the probability of the
+truth (no lump, or one near its true place), at least `REWARD.minimum`.
 """
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -26,10 +26,18 @@ from palpate_models.numerics.frames import Array
 from palpate_search.posterior import LAYERS, Budget, Posterior, Task, maps, press_duration, shape
 
 ID: Final = "Palpate/Search-v0"
-REWARD_PER_S: Final = 0.01
-LEAST_REWARD: Final = -5.0
-NEAR_M: Final = 0.020
-"""A lump hypothesis within this distance of the true place counts as correct."""
+
+
+class RewardTuning(NamedTuple):
+    """Settings of the reward."""
+
+    per_s: float = 0.01
+    minimum: float = -5.0
+    near_m: float = 0.020
+    """A lump hypothesis within this distance of the true place counts as correct."""
+
+
+REWARD: Final = RewardTuning()
 ONE_MODEL: Final = ((1.0, 1.0),)
 """The reward uses one model of roughness and errors: a fifth of the computing time."""
 Observation = dict[str, NDArray[np.float32]]
@@ -79,12 +87,12 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         before, here = self._entropy(), self.posterior.here
         felt = self._hand.press(xy, float(depth))
         self.posterior.add(felt)
-        reward = before - self._entropy() - REWARD_PER_S * float(press_duration(here, xy))
+        reward = before - self._entropy() - REWARD.per_s * float(press_duration(here, xy))
         self._history[self._count] = (*(2 * share - 1), np.log(felt.force / 5.0), 1.0)
         self._count += 1
         over = self._count == self._presses
         if over:
-            reward += max(float(np.log(max(self._truth(), 1e-12))), LEAST_REWARD)
+            reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.minimum)
         info = {"lump": self.posterior.lump, "truth": self._truth()} if over else {}
         return self._observation(), float(reward), over, False, info
 
@@ -115,7 +123,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         centre: Array | None = self._case.centre
         if centre is None:
             return self.posterior.none
-        near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= NEAR_M
+        near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= REWARD.near_m
         return float(self.posterior.by_place[near].sum())
 
     def _observation(self) -> Observation:

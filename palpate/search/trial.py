@@ -23,11 +23,18 @@ from palpate_models.scenario.schema import Scenario
 from palpate_planning.stroke import STROKE
 from palpate_search.posterior import Policy, Posterior, Press, Task, press_duration
 
-TARE_N: Final = 0.05
-"""SD of the force after taring."""
-NOISE_N: Final = 0.02
-"""SD of the mean force of a press."""
-SHALLOWEST_M: Final = 0.002
+
+class SurrogateTuning(NamedTuple):
+    """Noise and least depth of the surrogate's presses."""
+
+    tare_n: float = 0.05
+    """SD of the force after taring."""
+    noise_n: float = 0.02
+    """SD of the mean force of a press."""
+    shallowest_m: float = 0.002
+
+
+SURROGATE: Final = SurrogateTuning()
 _EXPONENT: Final = (1.35, 0.1)
 """Mean and SD over persons of the surrogate's exponent of force over depth."""
 
@@ -114,9 +121,9 @@ class SurrogateHand(_BaseHand):
         if limited:
             depths = np.linspace(0.0, depth, 50)
             depth = float(np.interp(self.task.force, [felt(d) for d in depths.tolist()], depths))
-        force = max(felt(depth) + float(rng.normal(0.0, TARE_N) + rng.normal(0.0, NOISE_N)), 0.02)
-        x, y, measured = float(xy[0]), float(xy[1]), max(depth, SHALLOWEST_M)
-        return Press(x, y, measured, force, time, NOISE_N, limited, self.task.depth_uncertainty)
+        force = max(felt(depth) + float(rng.normal(0.0, SURROGATE.tare_n) + rng.normal(0.0, SURROGATE.noise_n)), 0.02)
+        x, y, measured = float(xy[0]), float(xy[1]), max(depth, SURROGATE.shallowest_m)
+        return Press(x, y, measured, force, time, SURROGATE.noise_n, limited, self.task.depth_uncertainty)
 
     def touched(self, xy: Array) -> Array:
         """Return where in the true abdomen frame the tool is at a place [m], both of shape (2,)."""

@@ -24,7 +24,7 @@ from operator import attrgetter
 from pathlib import Path
 from threading import Thread
 from time import monotonic, perf_counter, process_time, sleep
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import psutil
 
@@ -162,12 +162,18 @@ def _exit_with_parent(parent: int) -> None:
     os._exit(1)
 
 
-CONNECT_S: Final = 30
-"""Time limit for the connection to a scheduler."""
-TASKS_PER_WORKER: Final = 4
-"""Minimum number of tasks for each worker, so that none waits for another at the end."""
-POLL_S: Final = 2.0
-"""Interval of the check that the scheduler is alive."""
+class PoolTuning(NamedTuple):
+    """Distribution of cases to workers."""
+
+    connect_s: int = 30
+    """Time limit for the connection to a scheduler."""
+    tasks_per_worker: int = 4
+    """Minimum number of tasks for each worker, so that none waits for another at the end."""
+    poll_s: float = 2.0
+    """Interval of the check that the scheduler is alive."""
+
+
+POOL: Final = PoolTuning()
 MAX_CASES: Final = {"whole": 1, "quick": 8}
 """Maximum number of cases of one task; they share a process."""
 
@@ -216,7 +222,7 @@ def open_workers(count: int, scheduler: str | None = None) -> Iterator[Workers]:
                 stack.enter_context(local)
                 client = stack.enter_context(Client(local))
             else:
-                client = stack.enter_context(Client(scheduler, timeout=CONNECT_S))
+                client = stack.enter_context(Client(scheduler, timeout=POOL.connect_s))
         except (OSError, ValueError, TimeoutError) as error:
             raise StudyError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
         started = sum(client.nthreads().values()) or 1
@@ -261,7 +267,7 @@ def run_cases(
         for batch in _batches(folder.missing(cases), workers.count):
             submit(batch)
         while running:
-            ended, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            ended, _ = wait(running, timeout=POOL.poll_s, return_when=FIRST_COMPLETED)
             if not ended and workers.client.status != "running":  # a client without a scheduler would wait for ever
                 raise StudyStopped("connection to the scheduler lost")
             for future in ended:
@@ -287,7 +293,7 @@ def _batches(cases: Sequence[Case], workers: int) -> Iterator[list[Case]]:
     """Yield consecutive cases with the same periods, which are set for a whole process, enough batches for all workers."""
     for _, group in groupby(cases, key=attrgetter("periods")):
         same = list(group)
-        size = max(1, min(MAX_CASES[same[0].tier], len(cases) // (TASKS_PER_WORKER * workers)))
+        size = max(1, min(MAX_CASES[same[0].tier], len(cases) // (POOL.tasks_per_worker * workers)))
         yield from (same[k : k + size] for k in range(0, len(same), size))
 
 

@@ -73,16 +73,22 @@ class TrueSurface:
         return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))
 
 
-NEAREST: Final = 4
-"""Number of nearest contacts whose errors are averaged, weighted by inverse distance."""
-PITCH_M: Final = 0.010
-"""Distance of pressed places, over the examined region and a border of this width."""
-FINE_PITCH_M: Final = 0.005
-"""Distance of pressed places within `PITCH_M` of a lump's outline."""
-REACH_M: Final = 0.040
-"""A lump is not palpable further outside its outline than this plus its depth: the felt effect goes with the square of the
-influence K0(r / l) / K0(9 mm / l). There it is 0.3 % for the shortest l of the persons of seeds 1000 to 1099 (13 mm), 0.7 %
-for the median (17 mm) and 5 % for the longest (35 mm)."""
+class PressedGrid(NamedTuple):
+    """Pressed places and their reach."""
+
+    nearest: int = 4
+    """Number of nearest contacts whose errors are averaged, weighted by inverse distance."""
+    pitch_m: float = 0.010
+    """Distance of pressed places, over the examined region and a border of this width."""
+    fine_pitch_m: float = 0.005
+    """Distance of pressed places within `pitch_m` of a lump's outline."""
+    reach_m: float = 0.040
+    """A lump is not palpable further outside its outline than this plus its depth: the felt effect goes with the square of the
+    influence K0(r / l) / K0(9 mm / l). There it is 0.3 % for the shortest l of the persons of seeds 1000 to 1099 (13 mm), 0.7 %
+    for the median (17 mm) and 5 % for the longest (35 mm)."""
+
+
+GRID: Final = PressedGrid()
 RASTER_M: Final = 0.001
 """Pitch of the raster on which areas are compared."""
 PALPABLE: Final = 0.05
@@ -105,7 +111,7 @@ class Touched:
         """Return true places of the tool for estimated ones xy [m], both of shape (p, 2)."""
         if self._tree is None:
             return xy
-        count = min(NEAREST, len(self.believed))
+        count = min(GRID.nearest, len(self.believed))
         distance, index = (np.asarray(a).reshape(len(xy), count) for a in self._tree.query(xy, k=count))
         weight = 1.0 / (distance + 1e-4)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -215,13 +221,13 @@ def _code(scenario: Scenario) -> list[Path]:
 
 def _places(skin: TrueSurface, exam: Exam, areas: Sequence[Lesion | Structure]) -> tuple[Array, Array]:
     """Return places on the skin [m] and outward unit normals, shape (p, 3): a grid, finer near outlines."""
-    centre, half = np.asarray(exam.centre_m), 0.5 * np.asarray(exam.region_m) + PITCH_M
-    count = np.ceil(half / FINE_PITCH_M - 1e-9).astype(int)
+    centre, half = np.asarray(exam.centre_m), 0.5 * np.asarray(exam.region_m) + GRID.pitch_m
+    count = np.ceil(half / GRID.fine_pitch_m - 1e-9).astype(int)
     count += count % 2  # the coarse grid is every second point of the fine one, up to the border
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(-n, n + 1) for n in count)))
     xy = centre + np.column_stack((i, j)) * half / count
     coarse = (i % 2 == 0) & (j % 2 == 0)
-    edge = np.any([np.abs(edge_distance(xy, area)) <= PITCH_M for area in areas], axis=0) if areas else coarse
+    edge = np.any([np.abs(edge_distance(xy, area)) <= GRID.pitch_m for area in areas], axis=0) if areas else coarse
     places, normals = skin.points(xy[coarse | edge])
     on_skin = np.isfinite(places).all(axis=1) & np.isfinite(normals).all(axis=1)
     return places[on_skin], normals[on_skin]
@@ -229,7 +235,7 @@ def _places(skin: TrueSurface, exam: Exam, areas: Sequence[Lesion | Structure]) 
 
 def _near(places: Array, areas: Sequence[Lesion | Structure]) -> Mask:
     """Return True where each area may be palpable, shape (l, p)."""
-    near = [edge_distance(places[:, :2], area) <= REACH_M + (area.depth_m or 0.0) for area in areas]
+    near = [edge_distance(places[:, :2], area) <= GRID.reach_m + (area.depth_m or 0.0) for area in areas]
     return np.array(near, dtype=bool).reshape(len(areas), len(places))
 
 

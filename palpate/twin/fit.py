@@ -295,16 +295,24 @@ def _surface(recording: PalpationRecording, stiffness: Stiffness, edge: float, o
 
 
 GRID: Final = "twin.csv"
-ELASTIC_PRESSES: Final = 20
-"""Presses from which the scale of Young's modulus is found."""
-ELASTIC_STEPS: Final = 8
-"""Time steps of such a press: it goes down during the first half."""
-MIN_RADIUS_M: Final = 0.002
-"""Minimum radius of a lump."""
-RING_RADII: Final = 2.0
-"""The surroundings of a finding reach this many of its radii."""
-MIN_CONTRAST: Final = 1.05
-"""Minimum change of the modulus, up or down."""
+
+
+class TwinTuning(NamedTuple):
+    """Presses of the elastic twin, and findings that become lumps."""
+
+    presses: int = 20
+    """Presses from which the scale of Young's modulus is found."""
+    steps: int = 8
+    """Time steps of such a press: it goes down during the first half."""
+    min_radius_m: float = 0.002
+    """Minimum radius of a lump."""
+    ring: float = 2.0
+    """The surroundings of a finding reach this many of its radii."""
+    min_contrast: float = 1.05
+    """Minimum change of the modulus, up or down."""
+
+
+TWIN: Final = TwinTuning()
 
 
 class Quality(NamedTuple):
@@ -366,14 +374,14 @@ def _lumps(vertices: Array, finding: NDArray[np.int32], wall: FittedWall) -> lis
         if not len(inside):
             continue
         x, y = inside.mean(axis=0).tolist()
-        a, b = np.maximum(2 * inside.std(axis=0), MIN_RADIUS_M).tolist()  # of a uniform ellipse
+        a, b = np.maximum(2 * inside.std(axis=0), TWIN.min_radius_m).tolist()  # of a uniform ellipse
         away = np.linalg.norm((nodes - (x, y)) / (a, b), axis=1)
         k_w = wall.grid.k_w_n_per_m3
-        ring = (away > 1) & (away <= RING_RADII)
+        ring = (away > 1) & (away <= TWIN.ring)
         if not ring.any():
             continue
         contrast = float(np.clip(np.median(k_w[away <= 1]) / np.median(k_w[ring]), 0.1, 20))
-        if max(contrast, 1 / contrast) >= MIN_CONTRAST:
+        if max(contrast, 1 / contrast) >= TWIN.min_contrast:
             lumps.append(Lesion(centre_m=(x, y), radii_m=(a, b), contrast=contrast, edge_m=min(0.008, a, b)))
     return lumps
 
@@ -413,15 +421,15 @@ def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array
     service = elastic_service(scenario)
     assert isinstance(service, TissueService)
     fitted = np.flatnonzero(~wall.held_out)
-    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // ELASTIC_PRESSES)]]
-    step = float(np.median([press.time[-1] for press in presses])) / ELASTIC_STEPS
+    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // TWIN.presses)]]
+    step = float(np.median([press.time[-1] for press in presses])) / TWIN.steps
     tissue = service.backend.in_steps_of(step)
     expected = []
     for press, place, normal in zip(presses, *skin_at(tissue.model, presses), strict=True):
         tissue.settle()
         depth = press.depth.max() + wall.onset_m
-        for k in range(1, ELASTIC_STEPS + 1):
-            centre = place + (radius - depth * min(1.0, 2 * k / ELASTIC_STEPS)) * normal
+        for k in range(1, TWIN.steps + 1):
+            centre = place + (radius - depth * min(1.0, 2 * k / TWIN.steps)) * normal
             force, _ = tissue.step(k * step, centre, np.zeros(3), radius)
         expected.append(float(force @ normal))
     return np.array([press.felt for press in presses]), np.array(expected)

@@ -5,7 +5,7 @@ Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however
 """
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,14 +22,22 @@ FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
 MADE: Final = ("contrast", "radius_m", "depth_m")
 """The lump itself: stiffness relative to its surroundings, radius, depth."""
 LOGARITHMIC: Final = ("felt_contrast", "contrast")
-MAX_LAPSE: Final = 0.25
-PRIOR_SD: Final = 10.0
-"""Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all,
-the likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
-PLOT_BINS: Final = 6
-"""Bins of equal number in plots."""
-MIN_LUMPS: Final = 10
-"""Minimum numbers of found and of missed lumps for a fit."""
+
+
+class DetectabilityTuning(NamedTuple):
+    """Settings of the fit."""
+
+    max_lapse: float = 0.25
+    prior_sd: float = 10.0
+    """Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all,
+    the likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+    bins: int = 6
+    """Bins of equal number in plots."""
+    min_lumps: int = 10
+    """Minimum numbers of found and of missed lumps for a fit."""
+
+
+FIT: Final = DetectabilityTuning()
 QUARTILES: Final = (0.25, 0.5, 0.75)
 
 
@@ -104,11 +112,11 @@ class Surface(Row, allow_inf_nan=False):
 
 
 def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Surface | None:
-    """Return the surface of one method; None with fewer than `MIN_LUMPS` lumps found or missed, or if all lumps are equal."""
+    """Return the surface of one method; None with fewer than `FIT.min_lumps` lumps found or missed, or if all lumps are equal."""
     lumps = variant.lumps.dropna(subset=list(names))
     lumps = lumps[(lumps[[name for name in names if name in LOGARITHMIC]] > 0).all(axis=1)]
     found = lumps["found"].to_numpy(dtype=bool)
-    if min(found.sum(), (~found).sum()) < MIN_LUMPS:
+    if min(found.sum(), (~found).sum()) < FIT.min_lumps:
         return None
     varied = tuple(name for name in names if np.ptp(lumps[name].to_numpy(dtype=np.float64)) > 1e-9)
     if not varied:
@@ -149,7 +157,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
     sign = np.where(found, 1.0, -1.0)
 
     def lapse_of(free: float) -> float:
-        return MAX_LAPSE * float(expit(free)) if with_lapse else 0.0
+        return FIT.max_lapse * float(expit(free)) if with_lapse else 0.0
 
     def cost(parameters: Array) -> tuple[float, Array]:
         b, lapse = parameters[:k], lapse_of(float(parameters[k])) if with_lapse else 0.0
@@ -158,16 +166,16 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
         p = np.clip(np.where(found, hit, 1 - hit), 1e-12, None)
         slopes = np.append(0.0, b[1:])
         d_p = count * sign / p
-        gradient = -(d_p * (1 - lapse) * s * (1 - s)) @ z + slopes / PRIOR_SD**2
-        value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * PRIOR_SD**2)
+        gradient = -(d_p * (1 - lapse) * s * (1 - s)) @ z + slopes / FIT.prior_sd**2
+        value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * FIT.prior_sd**2)
         if not with_lapse:
             return value, gradient
-        d_lapse = float(d_p @ s) * lapse * (1 - lapse / MAX_LAPSE)
+        d_lapse = float(d_p @ s) * lapse * (1 - lapse / FIT.max_lapse)
         return value, np.append(gradient, d_lapse)
 
     begin = np.zeros(k) if start is None else start[:k]
     if with_lapse:
-        share = 0.1 if start is None else np.clip(start[k] / MAX_LAPSE, 0.02, 0.98)
+        share = 0.1 if start is None else np.clip(start[k] / FIT.max_lapse, 0.02, 0.98)
         begin = np.append(begin, logit(share))
     done = minimize(cost, begin, jac=True, method="L-BFGS-B")
     lapse = lapse_of(float(done.x[k])) if with_lapse else 0.0
@@ -179,7 +187,7 @@ def observe_shares(variant: Variant, name: str, bootstrap: Bootstrap) -> list[tu
     lumps = variant.lumps.dropna(subset=[name])
     if lumps.empty:
         return []
-    edges = pd.qcut(lumps[name].astype(float), PLOT_BINS, labels=False, duplicates="drop")
+    edges = pd.qcut(lumps[name].astype(float), FIT.bins, labels=False, duplicates="drop")
     parts = [part for _, part in lumps.groupby(edges)]
     return [(float(part[name].mean()), bootstrap.share(part["found"], part["patient"], "lumps")) for part in parts]
 
