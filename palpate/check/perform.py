@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep, time_ns
-from typing import Any, Final
+from typing import Any, NamedTuple
 
 import typer
 import zenoh
@@ -36,14 +36,21 @@ from palpate_errors import restate
 from palpate_inputs import parse_json
 from palpate_models.scenario.load import dump_scenario, view_of
 
-HELLO_S: Final = 0.05
-READY_S: Final = 20.0
-"""For an implementation on the bus to answer on every edge."""
-LEAD_NS: Final = 200 * MS
-"""From the grant to the common start."""
-CONTROL_S: Final = 0.4
-"""Between control messages."""
-FINISH_S: Final = 10.0
+
+class ProtocolTiming(NamedTuple):
+    """Intervals and limits of the run protocol."""
+
+    hello_s: float = 0.05
+    ready_s: float = 20.0
+    """For an implementation on the bus to answer on every edge."""
+    lead_ns: int = 200 * MS
+    """From the grant to the common start."""
+    control_s: float = 0.4
+    """Between control messages."""
+    finish_s: float = 10.0
+
+
+TIMING = ProtocolTiming()
 
 
 class LiveRig(Rig):
@@ -84,11 +91,11 @@ class LiveRig(Rig):
                 reason = f"no node {self.role.name!r} appeared within {seconds:.0f} s"
                 raise NoBusError(f"{reason}; it needs a liveliness token of that name")
             self._say(RunControl.HELLO)
-            sleep(HELLO_S)
+            sleep(TIMING.hello_s)
         self.expect("joins as a node of its role", True, self.role.name, self.role.name)
         self._greet()
         self._check_graph()
-        self._epoch = time_ns() + LEAD_NS
+        self._epoch = time_ns() + TIMING.lead_ns
         self._say(RunControl.GRANT, self._epoch)
         while time_ns() < self._epoch:
             sleep(0.002)
@@ -99,13 +106,13 @@ class LiveRig(Rig):
         return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
 
     def _greet(self) -> None:
-        end = monotonic() + READY_S
+        end = monotonic() + TIMING.ready_s
         missing: list[str] | None = None
         while missing != [] and monotonic() < end:
             self._say(RunControl.HELLO)
             for publisher in self._publishers.values():
                 publisher.hello()
-            sleep(HELLO_S)
+            sleep(TIMING.hello_s)
             for message in self._receive_reports():
                 if message.state == ServiceReport.READY:
                     missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
@@ -135,13 +142,13 @@ class LiveRig(Rig):
         self._disturb()
         self.section("end")
         self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
-        end = monotonic() + FINISH_S
+        end = monotonic() + TIMING.finish_s
         while not self.finished and monotonic() < end:
             self._receive_reports()
             self._drain()
             sleep(0.02)
         got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
-        self.expect("reports FINISHED at the end", self.finished, f"within {FINISH_S:.0f} s", got)
+        self.expect("reports FINISHED at the end", self.finished, f"within {TIMING.finish_s:.0f} s", got)
         self._say(RunControl.END)
 
     def close(self) -> None:
@@ -203,7 +210,7 @@ class LiveRig(Rig):
                         self.send(name, message)
             self.t = now
             self._drain()
-            if monotonic() - self._last_control > CONTROL_S:
+            if monotonic() - self._last_control > TIMING.control_s:
                 self._say(RunControl.GRANT, self._epoch)
                 self._receive_reports()
             if now >= end:

@@ -31,14 +31,21 @@ from palpate_errors import ExitStatus, UserError
 if TYPE_CHECKING:
     from palpate.fuzz.bus_readers import FuzzTarget
 
-SLOW_S: Final = 1.0
-"""Processor time above which an input is a find, since it would delay a service."""
-HANGING_S: Final = 60.0
-"""Wall-clock time after which an input that does not return is a find, and ends its target."""
-MEMORY_BYTES: Final = 1 << 30
-"""Memory that a target may allocate beyond that of its libraries."""
-KEPT: Final = 64
-"""Inputs per target that are kept for splicing."""
+
+class FuzzLimits(NamedTuple):
+    """Limits of an attempt."""
+
+    slow_s: float = 1.0
+    """Processor time above which an input is a find, since it would delay a service."""
+    hanging_s: float = 60.0
+    """Wall-clock time after which an input that does not return is a find, and ends its target."""
+    memory_bytes: int = 1 << 30
+    """Memory that a target may allocate beyond that of its libraries."""
+    kept: int = 64
+    """Inputs per target that are kept for splicing."""
+
+
+LIMITS: Final = FuzzLimits()
 _WRITES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _CHANGES: Final = frozenset(("os.mkdir", "os.rename", "os.link", "os.symlink", "os.remove", "os.rmdir", "os.truncate"))
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
@@ -53,7 +60,7 @@ class FuzzPlan(NamedTuple):
     """Processor time [s]."""
     max_found: int = 100
     """Finds after which it stops."""
-    slow_s: float = SLOW_S
+    slow_s: float = LIMITS.slow_s
 
 
 class Find(NamedTuple):
@@ -110,7 +117,7 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
     return bytes(changed)
 
 
-def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | bool:
+def attempt(target: FuzzTarget, data: bytes, slow_s: float = LIMITS.slow_s) -> Find | bool:
     """Run one input; return a find, else True if it was accepted."""
     begin = thread_time()
     try:
@@ -126,7 +133,7 @@ def _confine(target: FuzzTarget, seeds: Sequence[bytes], written: list[str]) -> 
     for data in seeds:  # first, since they import libraries
         attempt(target, data)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    limit = pages * resource.getpagesize() + MEMORY_BYTES
+    limit = pages * resource.getpagesize() + LIMITS.memory_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     inside = f"{Path.cwd()}{os.sep}"
 
@@ -151,7 +158,7 @@ def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> Ta
         data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
         if number % 997 == 0:
             pool[rng.randrange(len(pool))] = data  # so that changes accumulate
-            pool += target.seeds(rng)[: max(KEPT - len(pool), 0)]
+            pool += target.seeds(rng)[: max(LIMITS.kept - len(pool), 0)]
         outcome = attempt(target, data, plan.slow_s)
         if written:
             outcome = Find(target.name, data, f"opens for writing: {written[0]}")
@@ -186,7 +193,7 @@ def campaign(
                 return _fuzz(target, plan, place)
 
         try:
-            limit = TimeLimit(lambda place=place: (place[0],), lambda: HANGING_S)  # type: ignore[misc]
+            limit = TimeLimit(lambda place=place: (place[0],), lambda: LIMITS.hanging_s)  # type: ignore[misc]
             result = run_apart(work, check=limit.check)
         except ChildLost as lost:
             find = Find(target.name, b"", f"input {place[0]} of seed {plan.seed}: the process {lost}")

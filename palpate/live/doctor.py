@@ -23,12 +23,19 @@ from palpate_bus.security.access import public
 from palpate_bus.wire.liveliness import mismatches
 from palpate_errors import ExitStatus
 
-POLL_S: Final = 0.04
-MIN_SHARED_MEMORY_MB: Final = 64
-"""Minimum free shared memory: with less, large messages may fall back to the network."""
-MIN_MESSAGE_AGE_MS: Final = -2.0
-"""A message with a smaller age was stamped by a clock that is ahead of the local one."""
-SILENT_S: Final = 5.0
+
+class DoctorLimits(NamedTuple):
+    """Limits beyond which the doctor reports a fault."""
+
+    poll_s: float = 0.04
+    min_shared_memory_mb: int = 64
+    """Minimum free shared memory: with less, large messages may fall back to the network."""
+    min_message_age_ms: float = -2.0
+    """A message with a smaller age was stamped by a clock that is ahead of the local one."""
+    silent_s: float = 5.0
+
+
+LIMITS: Final = DoctorLimits()
 SHARED_MEMORY = Path("/dev/shm")
 
 
@@ -76,7 +83,7 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
     try:
         while monotonic() < end:
             live.poll()
-            sleep(POLL_S)
+            sleep(LIMITS.poll_s)
         live.poll()
         of_bus = _versions(bus), _endpoints(bus, live), _shared_memory(bus)
         parts = *of_bus, _clock(live), _who(bus, live), _progress(live), _types(live)
@@ -124,7 +131,7 @@ def _shared_memory(bus: Joined) -> Iterator[Remark]:
     else:
         state = os.statvfs(SHARED_MEMORY)
         free, size = state.f_bavail * state.f_frsize / 1e6, state.f_blocks * state.f_frsize / 1e6
-        few = free < MIN_SHARED_MEMORY_MB
+        few = free < LIMITS.min_shared_memory_mb
         hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if few else ""
         text = f"{SHARED_MEMORY}: {free:.0f} MB of {size:.0f} MB free{hint}"
         yield Remark("shared memory", Severity.WARN if few else Severity.OK, text)
@@ -139,7 +146,7 @@ def _clock(live: LiveMonitor) -> Iterator[Remark]:
         text = f"{kind} time {time / 1e9:.2f} s, {moves}"
     yield Remark("clock", Severity.OK if time is not None and progress else Severity.WARN, text)
     for name, age in live.offsets.items():
-        if age < MIN_MESSAGE_AGE_MS:
+        if age < LIMITS.min_message_age_ms:
             sender = live.monitor.contract.topics[name].producer
             text = f"the clock of {sender}'s host is at least {-age:.1f} ms ahead of ours ({name}); synchronise them (NTP, PTP)"
             yield Remark("clock", Severity.WARN, text)
@@ -165,7 +172,7 @@ def _progress(live: LiveMonitor) -> Iterator[Remark]:
     """Report which service waits for which, from the services' own reports."""
     now = monotonic()
     for role, (_, received) in sorted(live.reports.items()):
-        if now - received > SILENT_S:
+        if now - received > LIMITS.silent_s:
             yield Remark("progress", Severity.WARN, f"{role} has not reported for {now - received:.0f} s")
     if live.reports and live.monitor.time.progress == 0:
         for role, (report, _) in sorted(live.reports.items()):
@@ -222,7 +229,7 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
                 else:
                     line = Text.assemble((f"{after_s:8.2f} s", "dim"), "  ", (str(violation), "red"))
                     wide_console().print(line, soft_wrap=True)
-            sleep(POLL_S)
+            sleep(LIMITS.poll_s)
     finally:
         live.close()
 

@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from math import inf
 from time import monotonic
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import typer
@@ -26,15 +26,22 @@ from palpate_bus.wire.rmw import parse_key, topic_key
 from palpate_bus.wire.transport import ReceivedSample, Subscription
 from palpate_errors import restate
 
-REPORT_PERIOD_S: Final = 1.0
-SILENT_S: Final = 5.0
-"""A topic without a message for this time is announced."""
-BANDWIDTH_PERIODS: Final = 5
-"""Bandwidth is the mean over this many report periods."""
-SPACING_MESSAGES: Final = 10_000
-"""Maximum number of messages over which rate and spacing are computed."""
-SHOWN_ITEMS: Final = 12
-"""Longer arrays are shortened in the output."""
+
+class TopicTimes(NamedTuple):
+    """Windows of the statistics, and limits of the output."""
+
+    report_period_s: float = 1.0
+    silent_s: float = 5.0
+    """A topic without a message for this time is announced."""
+    bandwidth_periods: int = 5
+    """Bandwidth is the mean over this many report periods."""
+    spacing_messages: int = 10_000
+    """Maximum number of messages over which rate and spacing are computed."""
+    shown_items: int = 12
+    """Longer arrays are shortened in the output."""
+
+
+TOPIC: Final = TopicTimes()
 
 app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
@@ -155,7 +162,7 @@ def echo(options: EchoOptions) -> None:
 def hz(options: StreamOptions) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
     with _subscribe(options) as (topic, reader):
-        rows: deque[tuple[int, int | None]] = deque(maxlen=SPACING_MESSAGES)
+        rows: deque[tuple[int, int | None]] = deque(maxlen=TOPIC.spacing_messages)
         for received in _each_period(reader, options.seconds):
             rows.extend((message.sent, _stamp_ns(message, topic)) for message in received)
             _print_rate(list(rows)[-len(received) - 1 :], topic, options.as_json)
@@ -168,11 +175,11 @@ def hz(options: StreamOptions) -> None:
 def bw(options: StreamOptions) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
     with _subscribe(options) as (topic, reader):
-        window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
+        window: deque[list[int]] = deque(maxlen=TOPIC.bandwidth_periods)
         for received in _each_period(reader, options.seconds):
             window.append([len(message.payload) for message in received])
             sizes = [size for period in window for size in period]
-            rate, mean = sum(sizes) / (len(window) * REPORT_PERIOD_S), sum(sizes) / max(len(sizes), 1)
+            rate, mean = sum(sizes) / (len(window) * TOPIC.report_period_s), sum(sizes) / max(len(sizes), 1)
             if options.as_json:
                 print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
             else:
@@ -230,18 +237,18 @@ def _until(reader: Subscription, seconds: float | None) -> Iterator[ReceivedSamp
         if (received := reader.get(0.1)) is not None:
             silent = False
             yield received
-        elif silent and monotonic() - begin > SILENT_S:
+        elif silent and monotonic() - begin > TOPIC.silent_s:
             silent = False
             limit = "until Ctrl-C" if seconds is None else f"{seconds:g} s at most"
-            say(f"no message on {parse_key(reader.key).topic} for {SILENT_S:g} s; waiting {limit}")
+            say(f"no message on {parse_key(reader.key).topic} for {TOPIC.silent_s:g} s; waiting {limit}")
 
 
 def _each_period(reader: Subscription, seconds: float | None) -> Iterator[list[ReceivedSample]]:
     """Yield the messages of each report period until the time is over."""
     left = inf if seconds is None else seconds
     while left > 0:
-        yield list(_until(reader, min(left, REPORT_PERIOD_S)))
-        left -= REPORT_PERIOD_S
+        yield list(_until(reader, min(left, TOPIC.report_period_s)))
+        left -= TOPIC.report_period_s
 
 
 def _message(received: ReceivedSample, topic: Topic) -> Any:
@@ -273,7 +280,7 @@ def _plain(value: Any, full: bool) -> Any:
         names = [field.name for field in fields(value) if not field.name.isupper() and field.name != "__msgtype__"]
         return {name: _plain(getattr(value, name), full) for name in names}
     if isinstance(value, np.ndarray | list | tuple):
-        items = [_plain(item, full) for item in (value if full else value[:SHOWN_ITEMS])]
+        items = [_plain(item, full) for item in (value if full else value[: TOPIC.shown_items])]
         return items if len(items) == len(value) else [*items, f"... {len(value)} items"]
     return value.item() if isinstance(value, np.generic) else value
 

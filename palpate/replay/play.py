@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 from time import monotonic_ns, sleep
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 from palpate.console import SteadyConsole, TimeLeft
 from palpate_bus.contract import Contract, contract
@@ -23,9 +23,17 @@ DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Endpoint of a replay if the environment names none: ROS 2's rmw_zenoh expects its router here."""
 LOOK_NS = NS
 """The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
-LONGEST_NS: Final = 7 * 86400 * NS
-"""Longest recording that is played [ns]; a longer one has stamps of two clocks."""
-CLOCK_PERIOD_NS: Final = 10 * MS
+
+
+class PlayTimes(NamedTuple):
+    """Times of a replay."""
+
+    longest_ns: int = 7 * 86400 * NS
+    """Longest recording that is played [ns]; a longer one has stamps of two clocks."""
+    clock_period_ns: int = 10 * MS
+
+
+PLAY: Final = PlayTimes()
 
 
 class Player:
@@ -52,7 +60,7 @@ class Player:
         recording.check(contract(), self.topics, whole=False)
         self.origin = recording.origin(self.topics)
         """Stamp [ns] from which the times of `play` count."""
-        if (span := recording.last - self.origin) > LONGEST_NS:
+        if (span := recording.last - self.origin) > PLAY.longest_ns:
             raise UserError(f"{recording.path}: its stamps span {span / NS / 86400:.0f} days: some of them are wrong")
         options = _options(listen)
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
@@ -133,8 +141,8 @@ class Player:
 
     def _tick(self) -> None:
         message = Clock(time_message(self._next_clock))
-        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // CLOCK_PERIOD_NS + 1)
-        self._next_clock += CLOCK_PERIOD_NS
+        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // PLAY.clock_period_ns + 1)
+        self._next_clock += PLAY.clock_period_ns
 
     def _wait(self, due: int) -> None:
         left = due - monotonic_ns()

@@ -172,7 +172,7 @@ def test_a_live_robot_that_applies_what_is_beyond_its_limit_is_named(monkeypatch
     monkeypatch.setattr(Driver, "_torque_fault", lambda *_: None)
     rig = ServiceRig(made("robot"), RigSettings(SCENARIO, slack_ms=20))
     rig.run(0.1, robot.quiet(rig))
-    robot._provoke(rig, "a torque", robot.BEYOND * np.eye(7)[0] * robot._arm(rig).torque_nm, RobotStatus.CAUSE_TORQUE_LIMIT)
+    robot._provoke(rig, "a torque", robot.TOUCH.beyond * np.eye(7)[0] * robot._arm(rig).torque_nm, RobotStatus.CAUSE_TORQUE_LIMIT)
     assert [result.name for result in rig.report.failed] == ["a torque makes it hold"]
 
 

@@ -5,7 +5,7 @@ Those of the contract on every implementation are here, checked over all message
 
 from importlib import import_module
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,18 @@ def check(rig: Rig) -> ConformanceReport:
     return rig.report
 
 
-RATE: Final = 0.2
-"""Largest relative error of a live implementation's rate, over the whole check."""
-STAMP_MS: Final = 100.0
-"""Largest median difference of a live implementation's stamps from the check's clock, in addition to the slack."""
-LOST_SHARE: Final = 0.05
-"""Largest share of a live implementation's messages that may be lost in transport."""
+class LiveTolerances(NamedTuple):
+    """Tolerances of topics of a live implementation."""
+
+    rate: float = 0.2
+    """Largest relative error of a live implementation's rate, over the whole check."""
+    stamp_ms: float = 100.0
+    """Largest median difference of stamps from the check's clock, in addition to the slack."""
+    lost_share: float = 0.05
+    """Largest share of a live implementation's messages that may be lost in transport."""
+
+
+LIVE: Final = LiveTolerances()
 
 
 def _contract(rig: Rig) -> None:
@@ -80,7 +86,7 @@ def _rate(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
     rate = (len(received) - 1) / seconds if seconds > 0 else 0.0
     off = abs(rate * topic.period_ms / 1000 - 1)
     longest = max((b.sent - a.sent for a, b in pairwise(received)), default=0) / MS
-    rig.expect(f"{topic.name}: rate", off < RATE, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
+    rig.expect(f"{topic.name}: rate", off < LIVE.rate, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
 
 
 def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
@@ -93,7 +99,7 @@ def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
     rig.expect(f"{topic.name}: stamps rise", not back, "never backwards", got)
     if rig.live:
         off = abs(np.median([(t - stamp) / MS for t, stamp in stamps]))
-        rig.below(f"{topic.name}: stamps", off, STAMP_MS + rig.settings.slack_ms, "ms off this check's clock (median)")
+        rig.below(f"{topic.name}: stamps", off, LIVE.stamp_ms + rig.settings.slack_ms, "ms off this check's clock (median)")
     else:
         own_rate = rig.settings.scenario.robot.driver.emulated and topic.max_age_ms is not None  # 500 Hz, say
         age = topic.max_age if own_rate else 0
@@ -106,6 +112,6 @@ def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
 def _sequence(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
     steps = np.diff([item.sequence for item in received])
     jumps = int(np.sum(steps != 1))
-    ok = bool(np.all(steps > 0)) and jumps <= (LOST_SHARE * len(steps) if rig.live else 0)
+    ok = bool(np.all(steps > 0)) and jumps <= (LIVE.lost_share * len(steps) if rig.live else 0)
     got = f"{jumps} jumps among {len(received)}" if jumps else "without a gap"
     rig.expect(f"{topic.name}: sequence", ok, "numbered 1, 2, 3, ... in the attachment", got)

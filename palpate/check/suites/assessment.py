@@ -25,11 +25,15 @@ class Belly(NamedTuple):
     """Force at the depth of the scan on unremarkable tissue."""
 
 
-BELLY = Belly()
-SPEED_MPS, SPACING_M = 0.03, 0.0125
-"""Of the played scan."""
-ANSWER_S = 30.0
-"""Wait for findings."""
+class ScanSettings(NamedTuple):
+    """The played scan and the wait for findings."""
+
+    speed_mps: float = 0.03
+    spacing_m: float = 0.0125
+    answer_s: float = 30.0
+
+
+BELLY, SCAN = Belly(), ScanSettings()
 
 
 def stiffness(r: float) -> float:
@@ -42,8 +46,8 @@ class PlayedScan:
 
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
         self._X_WA, self._depth, self._start = X_WA, depth, start
-        line = np.arange(-half, half, SPEED_MPS * 0.01)
-        rows = enumerate(np.arange(-half, half + 1e-9, SPACING_M))
+        line = np.arange(-half, half, SCAN.speed_mps * 0.01)
+        rows = enumerate(np.arange(-half, half + 1e-9, SCAN.spacing_m))
         self.path = np.vstack([np.column_stack((line[::-1] if i % 2 else line, np.full(len(line), y))) for i, y in rows])
         self.duration = len(self.path) * 0.01 + 1.0
 
@@ -95,7 +99,7 @@ def _samples(rig: Rig, half: float) -> None:
 
 def _findings(rig: Rig, play: PlayedScan) -> None:
     rig.section("findings")
-    answer = rig.await_message(FINDINGS, ANSWER_S, {"exam/state": play.state})
+    answer = rig.await_message(FINDINGS, SCAN.answer_s, {"exam/state": play.state})
     final = [item.message for item in answer if item.message.final]
     if not rig.equal("final findings once", len(final), 1):
         return

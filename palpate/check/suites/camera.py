@@ -1,6 +1,6 @@
 """Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,15 +14,21 @@ from palpate_models.numerics.frames import Array
 SMALL_WIDTHS = (48, 192)
 
 
-FRAMES: Final = 5
-"""Of a burst."""
-HALF_M: Final = 0.15
-"""Half the side of the plane in front of the camera."""
+class ViewedPlane(NamedTuple):
+    """The plane in front of the camera, and the burst."""
+
+    frames: int = 5
+    half_m: float = 0.15
+    """Half the side of the plane."""
+    pitch_m: float = 0.01
+
+
+PLANE: Final = ViewedPlane()
 
 
 def plane(centre: Array) -> Source:
     """Return the source of a level square about `centre`, in world."""
-    return lambda t: level(t, HALF_M, 0.01, centre)
+    return lambda t: level(t, PLANE.half_m, PLANE.pitch_m, centre)
 
 
 def suite(rig: Rig) -> None:
@@ -40,11 +46,11 @@ def suite(rig: Rig) -> None:
     rig.equal("takes no full frame without a request", len(silent[IMAGE]), 0)
     burst = _burst(rig, feed)
     images, infos = burst[IMAGE], burst[INFO]
-    rig.equal("takes as many frames as asked", len(images), FRAMES)
+    rig.equal("takes as many frames as asked", len(images), PLANE.frames)
     rig.equal("intrinsics with every image, of the same stamp", _stamps(infos), stamps := _stamps(images))
     period = rig.contract.topics[IMAGE].period
     rig.below("at its rate", max(abs(np.diff(stamps) - period), default=0), rig.slack + 1, "ms off", 1 / MS)
-    rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), FRAMES)
+    rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), PLANE.frames)
     if not images or not infos:
         return
     rig.section("images")
@@ -68,8 +74,8 @@ def _small(rig: Rig, images: list[ReceivedMessage], infos: list[ReceivedMessage]
 
 
 def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[ReceivedMessage]]:
-    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
-    return rig.run(0.1 * FRAMES + 0.5 + rig.slack_s, feed)
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), PLANE.frames))
+    return rig.run(0.1 * PLANE.frames + 0.5 + rig.slack_s, feed)
 
 
 def _format(rig: Rig, image: ReceivedMessage, info: ReceivedMessage) -> Array | None:
@@ -97,7 +103,7 @@ def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> 
     rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones(depth.shape)), axis=-1) @ X_WC[:3, :3].T
     expected = (centre[2] - X_WC[2, 3]) / rays[..., 2]
     hit = X_WC[:3, 3] + rays * expected[..., None]
-    on = (np.abs(hit - centre)[..., :2] < 0.8 * HALF_M).all(axis=-1) & (expected > 0)
+    on = (np.abs(hit - centre)[..., :2] < 0.8 * PLANE.half_m).all(axis=-1) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
     enough = error.size > 0.5 * max(int(on.sum()), 1)
     rig.below("a level plane is where it is", abs(np.median(error)) if enough else np.inf, 0.01, "mm off", 1e3)

@@ -1,6 +1,6 @@
 """Conformance of perception: the suite sends depth frames of a belly of known shape, and then none."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -13,14 +13,22 @@ from palpate_models.numerics.frames import Array, apply, inverse, look_at
 from palpate_models.scenario.load import exam_input
 
 MOTION, SURFACE, TARGETS = "perception/motion", "perception/surface", "perception/targets"
-FRAMES: Final = 4
-SIZE_PX: Final = (480, 640)
-"""Height and width of the full image."""
-FOCAL_PX: Final = 525.0
-FLOOR_M: Final = -0.12
-"""z of the floor in A."""
-ANSWER_S: Final = 10.0
-"""Simulated time limit for the answer to a trigger."""
+
+
+class SimulatedView(NamedTuple):
+    """Images that the suite sends, and its patience."""
+
+    frames: int = 4
+    size_px: tuple[int, int] = (480, 640)
+    """Height and width of the full image."""
+    focal_px: float = 525.0
+    floor_m: float = -0.12
+    """z of the floor in A."""
+    answer_s: float = 10.0
+    """Simulated time limit for the answer to a trigger."""
+
+
+VIEW: Final = SimulatedView()
 
 
 def suite(rig: Rig) -> None:
@@ -29,16 +37,16 @@ def suite(rig: Rig) -> None:
     X_WA = np.array(known.X_WA)
     camera = rig.settings.scenario.camera
     X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
-    K = np.array([[FOCAL_PX, 0.0, SIZE_PX[1] / 2], [0.0, FOCAL_PX, SIZE_PX[0] / 2], [0.0, 0.0, 1.0]])
-    depth = shapes.depth_image(K, inverse(X_WA) @ X_WC, SIZE_PX, FLOOR_M)
+    K = np.array([[VIEW.focal_px, 0.0, VIEW.size_px[1] / 2], [0.0, VIEW.focal_px, VIEW.size_px[0] / 2], [0.0, 0.0, 1.0]])
+    depth = shapes.depth_image(K, inverse(X_WA) @ X_WC, VIEW.size_px, VIEW.floor_m)
     rig.section("bursts")
     rig.send("tf_static", _tf(X_WC))
     feed = _frames(depth, K)
     untriggered = rig.run(0.5, feed)
     rig.equal("sends nothing without a trigger", len(untriggered[TARGETS]), 0)
-    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
-    answer = rig.await_message(TARGETS, ANSWER_S, feed)
-    if not rig.arrives("answers a burst", answer, f"{TARGETS} within {ANSWER_S:.0f} s"):
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), VIEW.frames))
+    answer = rig.await_message(TARGETS, VIEW.answer_s, feed)
+    if not rig.arrives("answers a burst", answer, f"{TARGETS} within {VIEW.answer_s:.0f} s"):
         return
     rig.section("surface")
     _surface(rig, X_WA)
@@ -47,8 +55,8 @@ def suite(rig: Rig) -> None:
     _following(rig, depth, K)
     rig.section("silence")
     before = len(rig.log[TARGETS])
-    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
-    rig.run(0.1 * FRAMES + 2.0 + rig.slack_s, {})
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), VIEW.frames))
+    rig.run(0.1 * VIEW.frames + 2.0 + rig.slack_s, {})
     late = rig.log[TARGETS][before:]
     ok = bool(late) and not len(late[-1].message.positions) and bool(late[-1].message.message)
     got = "no answer" if not late else f"{len(late[-1].message.positions)} targets: {late[-1].message.message}"
@@ -99,7 +107,7 @@ def _targets(rig: Rig, X_WA: Array) -> None:
     p_W = vectors(message.positions)
     sizes = {len(p_W), len(message.normals), len(message.lines)}
     rig.expect("targets, each with normal and line", len(sizes) == 1 and len(p_W) > 0, "some, of equal number", sorted(sizes))
-    rig.equal("fused all frames", message.frames_fused, FRAMES)
+    rig.equal("fused all frames", message.frames_fused, VIEW.frames)
     if not len(p_W):
         return
     exam = rig.settings.scenario.exam

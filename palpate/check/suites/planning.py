@@ -1,6 +1,6 @@
 """Role planning: the suite plays an arm that follows, up to the burst of depth frames; then an operator stops it."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -22,11 +22,16 @@ from palpate_models.robot.chain import Arm
 SETPOINT, STATE = "planning/setpoint", "exam/state"
 
 
-WEIGHT_N: Final = 6.0
-"""Of the tool of the played arm."""
-AWAIT_S: Final = 20.0
-SETTLE_SETPOINTS: Final = 20
-"""Set-points after the stop in which the arm may still come to rest."""
+class PlanningRig(NamedTuple):
+    """The simulated arm and the patience of the suite."""
+
+    weight_n: float = 6.0
+    await_s: float = 20.0
+    settle_setpoints: int = 20
+    """Set-points after the stop in which the arm may still come to rest."""
+
+
+RIG: Final = PlanningRig()
 STOP_REASON = "conformance check of the stop"
 
 
@@ -50,7 +55,7 @@ class PerfectFollower:
             self.q, velocity = np.array(setpoint.joint_position), np.array(setpoint.joint_velocity)
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
-        return robot_status(t, self.q, velocity, (0.0, 0.0, WEIGHT_N), np.zeros_like(self.q), self.mode, cause, reason)
+        return robot_status(t, self.q, velocity, (0.0, 0.0, RIG.weight_n), np.zeros_like(self.q), self.mode, cause, reason)
 
 
 def _supervise(t: int) -> Any:
@@ -67,8 +72,8 @@ def suite(rig: Rig) -> None:
         return
     _first(rig, arm.arm, received)
     rig.section("examination")
-    triggers = rig.await_message("planning/camera_trigger", AWAIT_S, arm.feed())
-    if rig.arrives("asks for depth frames", triggers, f"a camera_trigger within {AWAIT_S:.0f} s"):
+    triggers = rig.await_message("planning/camera_trigger", RIG.await_s, arm.feed())
+    if rig.arrives("asks for depth frames", triggers, f"a camera_trigger within {RIG.await_s:.0f} s"):
         rig.equal("as many as in the scenario", triggers[0].message.frames, rig.settings.scenario.camera.frames)
     _safe(rig, arm.arm, rig.log[SETPOINT])
     _phases(rig, rig.log[STATE])
@@ -80,7 +85,7 @@ def suite(rig: Rig) -> None:
     ok = state is not None and state.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_HELD) and STOP_REASON in state.message
     got = "no state" if state is None else f"phase {state.phase}: {state.message}"
     rig.expect("an operator's stop ends or holds the examination, with the operator's reason", ok, "aborted or held", got)
-    q = np.array([item.message.joint_position for item in after[SETPOINT][SETTLE_SETPOINTS:]])
+    q = np.array([item.message.joint_position for item in after[SETPOINT][RIG.settle_setpoints :]])
     if rig.expect("set-points continue after the stop", len(q) > 1, "100 Hz", len(q)):
         rig.below("and stand still", np.max(np.abs(q - q[0])), 0.05, "rad in a second")
     rig.section("silence")

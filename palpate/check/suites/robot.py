@@ -1,7 +1,7 @@
 """Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
 from itertools import chain, repeat
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,20 +15,28 @@ from palpate_models.robot.chain import Arm
 from palpate_models.scenario.schema import CommandLevel
 
 COMMAND = "control/joint_torque"
-PUSH_S: Final = 0.06
-PUSH_FRACTION: Final = 0.02
-"""Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
-PUSH_RAD: Final = 0.01
-"""Position step [rad] for an arm that takes positions."""
-RIPPLE_NM: Final = 1e-3
-"""Alternating part of a torque for a live arm: its port refuses a command that repeats for half a second."""
-BEYOND: Final = 1.02
-"""Torque beyond its limit, over the limit: a driver that does not check it applies it."""
-JUMP_RAD: Final = 0.1
-"""Jump of a position: more than the fastest joint travels within a few ms."""
-MOVED_RAD: Final = 2e-4
-DRIFT_RAD: Final = 0.05
-PRESS_N: Final = 10.0
+
+
+class RobotTouches(NamedTuple):
+    """Pushes on the robot, and its largest motion without."""
+
+    push_s: float = 0.06
+    push_fraction: float = 0.02
+    """Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
+    push_rad: float = 0.01
+    """Position step [rad] for an arm that takes positions."""
+    ripple_nm: float = 1e-3
+    """Alternating part of a torque for a live arm: its port refuses a command that repeats for half a second."""
+    beyond: float = 1.02
+    """Torque beyond its limit, over the limit: a driver that does not check it applies it."""
+    jump_rad: float = 0.1
+    """Jump of a position: more than the fastest joint travels within a few ms."""
+    moved_rad: float = 2e-4
+    drift_rad: float = 0.05
+    press_n: float = 10.0
+
+
+TOUCH: Final = RobotTouches()
 CEASED = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
 
 
@@ -65,7 +73,7 @@ def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK, first
     positions, none = _positions(rig), np.zeros(0)
     start = rig.last("joint_states").position if positions else 0.0
     valid = duration_message(rig.contract.topics[COMMAND].expiry)
-    ripple_nm = RIPPLE_NM if rig.live and not positions else 0.0
+    ripple_nm = TOUCH.ripple_nm if rig.live and not positions else 0.0
     pushes = chain([] if first is None else [first], repeat(push))
 
     def command(t: int) -> Any:
@@ -124,7 +132,7 @@ def _joints(rig: Rig, arm: Arm, received: list[ReceivedMessage]) -> None:
     inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
     limits = f"{np.rad2deg(arm.lower_rad).round()} to {np.rad2deg(arm.upper_rad).round()} deg"
     rig.expect("joints within their limits", inside, limits, np.rad2deg(q[-1]).round(1))
-    rig.below("holds still without commands", np.max(np.abs(q[-1] - q[0])), DRIFT_RAD, "rad in 0.5 s")
+    rig.below("holds still without commands", np.max(np.abs(q[-1] - q[0])), TOUCH.drift_rad, "rad in 0.5 s")
 
 
 def _description(rig: Rig) -> None:
@@ -140,7 +148,7 @@ def _gravity(rig: Rig) -> None:
     moved = rig.run(0.4, commanding(rig, _still(rig)))["joint_states"]
     _expect_mode(rig, "obeys commands", RobotStatus.MODE_ACTIVE)
     drift = np.max(np.abs(moved[-1].message.position - moved[0].message.position)) if moved else np.inf
-    rig.below("stays where it is when commanded nothing else: commands exclude gravity", drift, DRIFT_RAD, "rad in 0.4 s")
+    rig.below("stays where it is when commanded nothing else: commands exclude gravity", drift, TOUCH.drift_rad, "rad in 0.4 s")
 
 
 def _signs(rig: Rig) -> None:
@@ -151,12 +159,12 @@ def _signs(rig: Rig) -> None:
     for joint, name in enumerate(arm.joint_names):
         release(rig)
         push = _still(rig)
-        torque = PUSH_FRACTION * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
-        push[joint] = PUSH_RAD if _positions(rig) else torque
-        received = rig.run(PUSH_S, commanding(rig, push))["joint_states"]
+        torque = TOUCH.push_fraction * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
+        push[joint] = TOUCH.push_rad if _positions(rig) else torque
+        received = rig.run(TOUCH.push_s, commanding(rig, push))["joint_states"]
         rig.run(0.4, quiet(rig))
         q = np.array([item.message.position[joint] for item in received])
-        if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
+        if len(q) < 10 or q[-5:].mean() - q[:5].mean() < TOUCH.moved_rad:
             wrong.append(name)
         if not any(abs(item.message.effort[joint] - push[joint]) < 0.2 * push[joint] for item in received):
             unreported.append(name)
@@ -234,10 +242,10 @@ def _invalid(rig: Rig) -> None:
     _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
     huge = _still(rig)
     if _positions(rig):
-        huge[0] = JUMP_RAD
+        huge[0] = TOUCH.jump_rad
         _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND, refusable=False)
         return
-    huge[0] = BEYOND * _arm(rig).torque_nm[0]
+    huge[0] = TOUCH.beyond * _arm(rig).torque_nm[0]
     _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 
@@ -259,13 +267,13 @@ def _force(rig: Rig) -> None:
     _activate(rig)
     rig.run(0.4, quiet(rig))
     before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
-    push = Wrench(Vector3(0.0, 0.0, PRESS_N), Vector3(0.0, 0.0, 0.0))
+    push = Wrench(Vector3(0.0, 0.0, TOUCH.press_n), Vector3(0.0, 0.0, 0.0))
     pressing = {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), push)}
     pressed = _mean_force(rig.run(0.1, pressing)["ft/wrench"])
     R_WI = rotation(rig.last("sim/tool_state").pose.orientation)
-    off = np.linalg.norm(pressed - before - PRESS_N * R_WI[2])
+    off = np.linalg.norm(pressed - before - TOUCH.press_n * R_WI[2])
     rig.run(0.3, quiet(rig))
-    rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * PRESS_N, "N off in the sensor's axes")
+    rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * TOUCH.press_n, "N off in the sensor's axes")
 
 
 def _mean_force(received: list[ReceivedMessage]) -> Array:

@@ -1,6 +1,6 @@
 """Role supervisor: the suite plays arm and planning, violates one limit after another, and expects a stop for each."""
 
-from typing import Any, Final
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -15,18 +15,26 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import CommandLevel, Limits
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
-FORCE_ERROR_N: Final = 3.0
-"""Includes the sensor's bias, because the force is untared."""
-REACT_MS: Final = 150.0
-"""For an emergency stop."""
-SOFT_MS: Final = 400.0
-"""For a soft stop, which may wait for a reaction of planning."""
-SILENT_S: Final = 0.6
-RISE_NPS: Final = 10.0
-STEP_S: Final = 0.02
-SWING_RAD: Final = 0.3
-"""Amplitude and angular frequency of the motion in which the tool is weighed."""
-SWING_RADPS: Final = 1.0
+
+
+class Expected(NamedTuple):
+    """Tolerances and time limits of the supervisor, and the rise of the played force."""
+
+    force_error_n: float = 3.0
+    """Includes the sensor's bias, because the force is untared."""
+    react_ms: float = 150.0
+    """For an emergency stop."""
+    soft_ms: float = 400.0
+    """For a soft stop, which may wait for a reaction of planning."""
+    silent_s: float = 0.6
+    rise_nps: float = 10.0
+    step_s: float = 0.02
+    swing_rad: float = 0.3
+    """Amplitude and angular frequency of the motion in which the tool is weighed."""
+    swing_radps: float = 1.0
+
+
+EXPECTED = Expected()
 AWAY_RAD = (2.9, -2.9, 1.57, -1.57)
 """Turns of the first joint away from the patient; at least one of them, or the arm at zero, is probably outside the workspace."""
 STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
@@ -114,7 +122,7 @@ def suite(rig: Rig) -> None:
     rig.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _text(received))
     _expect_release(rig, arm, "and is released by the operator")
     for silent in (STATUS, EXAM):
-        received = rig.run(SILENT_S, arm.feed(silent))[STATE]
+        received = rig.run(EXPECTED.silent_s, arm.feed(silent))[STATE]
         _expect_level(rig, f"stops when {silent} is silent", received, EMERGENCY)
         _expect_release(rig, arm, f"and is released when {silent} is back")
     rig.lose("control")
@@ -128,7 +136,7 @@ def _measures(rig: Rig, arm: PlayedArm) -> None:
     rig.send(SURFACE, arm.surface(rig.t, 0.004))
     received = _press(rig, arm, 10.0)
     state = received[-1].message
-    rig.below("force is that on the tool", abs(state.force - 10.0), FORCE_ERROR_N, "N off")
+    rig.below("force is that on the tool", abs(state.force - 10.0), EXPECTED.force_error_n, "N off")
     rig.below("speed is that of the sphere", abs(state.speed - 0.05), 0.005, "m/s off")
     rig.below("depth is below the perceived surface", abs(state.depth - 0.004), 1e-3, "mm off", 1e3)
     _expect_level(rig, "and none of them is a reason to stop", received)
@@ -138,18 +146,18 @@ def _measures(rig: Rig, arm: PlayedArm) -> None:
 
 def _swing(rig: Rig, arm: PlayedArm) -> None:
     """Tilt the tool to and fro by the last joint but one, so that its weight can be measured, as on the way to a first target."""
-    for phase in np.arange(0.0, 2 * np.pi, SWING_RADPS * STEP_S):
-        arm.q[-2] = arm.home[-2] + SWING_RAD * np.sin(phase)
-        arm.qd[-2] = SWING_RAD * SWING_RADPS * np.cos(phase)
-        rig.run(STEP_S, arm.feed())
+    for phase in np.arange(0.0, 2 * np.pi, EXPECTED.swing_radps * EXPECTED.step_s):
+        arm.q[-2] = arm.home[-2] + EXPECTED.swing_rad * np.sin(phase)
+        arm.qd[-2] = EXPECTED.swing_rad * EXPECTED.swing_radps * np.cos(phase)
+        rig.run(EXPECTED.step_s, arm.feed())
     arm.calm()
 
 
 def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:
     """Press up to `force` [N] as slowly as an examination does, and hold for half a second."""
-    for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / RISE_NPS / STEP_S)):
+    for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / EXPECTED.rise_nps / EXPECTED.step_s)):
         arm.push_N = float(push)
-        rig.run(STEP_S, arm.feed())
+        rig.run(EXPECTED.step_s, arm.feed())
     return rig.run(0.5, arm.feed())[STATE]
 
 
@@ -200,8 +208,8 @@ def _stops(rig: Rig, arm: PlayedArm, what: str, levels: tuple[int, ...], *causes
     if first is not None:
         state = first.message
         rig.expect(f"and states the cause: {what}", state.cause in causes and bool(state.reason), wanted, _text([first]))
-        within_ms = REACT_MS if levels == EMERGENCY else SOFT_MS
-        within_ms = 1e3 * SILENT_S if state.cause == SupervisorState.CAUSE_SILENT else within_ms
+        within_ms = EXPECTED.react_ms if levels == EMERGENCY else EXPECTED.soft_ms
+        within_ms = 1e3 * EXPECTED.silent_s if state.cause == SupervisorState.CAUSE_SILENT else within_ms
         rig.below(f"in time: {what}", (first.t - start - rig.slack) / MS, within_ms + 1, "ms")
     if released:
         _expect_release(rig, arm, f"and is released {released}")

@@ -1,6 +1,6 @@
 """Role tissue: the suite moves an indenter above it, into it, along it and out again. The patient holds their breath."""
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,17 @@ TRUTH = "truth/indentation"
 PATIENT = "truth/patient"
 STILL = ("phantom.breathing.kind=none", "phantom.motion.kind=none")
 """Settings of a scenario whose patient neither breathes nor moves, so that the indenter alone causes forces."""
-SPEED_MPS: Final = 0.02
-DEPTH_M: Final = 0.008
-CLEARANCE_M: Final = 0.01
+
+
+class TestPress(NamedTuple):
+    """The press that the suite makes."""
+
+    speed_mps: float = 0.02
+    depth_m: float = 0.008
+    clearance_m: float = 0.01
+
+
+PRESS: Final = TestPress()
 
 
 class PressingTool:
@@ -64,22 +72,22 @@ def suite(rig: Rig) -> None:
     _check_patient(rig, truth)
     rig.section("contact")
     touch = p_W + n_W * radius
-    tool = PressingTool(touch + n_W * CLEARANCE_M, radius)
+    tool = PressingTool(touch + n_W * PRESS.clearance_m, radius)
     above = tool.rest(rig, 0.2)
     _check_free(rig, above, "no force out of contact")
     legs: list[tuple[list[ReceivedMessage], Array]] = []
-    down = tool.lead(rig, touch - n_W * DEPTH_M, (CLEARANCE_M + DEPTH_M) / SPEED_MPS)
+    down = tool.lead(rig, touch - n_W * PRESS.depth_m, (PRESS.clearance_m + PRESS.depth_m) / PRESS.speed_mps)
     legs.append((down, tool.v.copy()))
     _check_press(rig, down, n_W)
     legs.append((tool.rest(rig, 0.3), np.zeros(3)))
     tangent = np.cross(n_W, (0.0, 1.0, 0.0))
     tangent /= np.linalg.norm(tangent)
-    slide = tool.lead(rig, tool.p + tangent * 0.01, 0.01 / SPEED_MPS)
+    slide = tool.lead(rig, tool.p + tangent * 0.01, 0.01 / PRESS.speed_mps)
     legs.append((slide, tool.v.copy()))
     _check_slide(rig, slide, tangent, n_W)
     _check_truth(rig, n_W)
-    rise_m = DEPTH_M + 2 * CLEARANCE_M
-    up = tool.lead(rig, tool.p + n_W * rise_m, rise_m / SPEED_MPS)
+    rise_m = PRESS.depth_m + 2 * PRESS.clearance_m
+    up = tool.lead(rig, tool.p + n_W * rise_m, rise_m / PRESS.speed_mps)
     legs.append((up, tool.v.copy()))
     _check_free(rig, tool.rest(rig, 0.2), "no force after contact")
     _check_energy(rig, legs)
@@ -118,7 +126,7 @@ def _check_free(rig: Rig, received: list[ReceivedMessage], name: str) -> None:
 
 def _check_press(rig: Rig, received: list[ReceivedMessage], n_W: Array) -> None:
     normal = np.array([force(item) @ n_W for item in received])
-    got = f"{normal[-1]:.2f} N at {DEPTH_M * 1e3:.0f} mm, minimum {normal.min():.3f} N"
+    got = f"{normal[-1]:.2f} N at {PRESS.depth_m * 1e3:.0f} mm, minimum {normal.min():.3f} N"
     outward = normal[-1] > 0.05 and normal.min() > -1e-6
     rig.expect("a pressed surface pushes back, outward", outward, "a positive force along the normal", got)
     tenths = normal[normal > 0][:: max(1, int((normal > 0).sum()) // 10)]
@@ -164,4 +172,4 @@ def _surface(rig: Rig) -> None:
     rig.expect("sim/surface: triangles index its vertices", inside, "indices below the number of vertices")
     first = np.asarray(meshes[0].vertices).reshape(-1, 3)
     dent = max(float(np.max(np.linalg.norm(np.asarray(m.vertices).reshape(-1, 3) - first, axis=1))) for m in meshes)
-    rig.within("sim/surface: shows the indentation", 1e3 * dent, 0.3e3 * DEPTH_M, 3e3 * DEPTH_M, "mm")
+    rig.within("sim/surface: shows the indentation", 1e3 * dent, 0.3e3 * PRESS.depth_m, 3e3 * PRESS.depth_m, "mm")
