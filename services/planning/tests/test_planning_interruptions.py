@@ -201,6 +201,17 @@ def test_final_findings_that_arrive_in_a_stop_are_kept() -> None:
     assert world.status.phase is Phase.DONE
 
 
+def test_findings_that_are_final_before_the_end_do_not_end_the_examination() -> None:
+    world = World(known(**SMALL))
+    world.step()
+    now = Observation(world.t, SensorReading(world.t, world.q, np.zeros(6), np.zeros(7)))
+    world.exam.step(now._replace(findings_final=True))
+    world.exam._course.enter(Phase.RETURN, world.t, "going home")
+    for _ in range(3):
+        world.exam.step(now)
+    assert world.status.phase is Phase.ASSESS
+
+
 def test_an_arm_that_was_pushed_into_the_tissue_between_strokes_lifts_first() -> None:
     world = World(known(region_m=(0.025, 0.025), pattern="raster"))
     world.run(lambda: getattr(world.exam._course.palpation, "stage", None) is StrokeStage.TRANSFER)
