@@ -459,7 +459,7 @@ class ExaminationSequence:
         if self._course.failure:
             self._course.abort(now, self._course.failure)
         else:
-            self._findings_final = False  # findings of before know nothing of the end
+            self._findings_final = False  # earlier findings are not of the whole examination
             self._course.enter(Phase.ASSESS, now.t, FOR_FINDINGS.text, FOR_FINDINGS)
 
     def _assess(self, now: Observation, out: ExamStep) -> None:
