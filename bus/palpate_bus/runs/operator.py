@@ -56,9 +56,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
     missing: NotAnswered = NoConductorError("the run does not answer: its conductor has left, or has not started it yet")
     for reply in session.get(where, payload=payload, attachment=tag, timeout=2 * CONFIRM_S):
         if reply.ok is None:
-            missing = NotAnswered(
-                "the run does not answer: it is still starting and will obey at its first tick, or its conductor stands still"
-            )
+            missing = NotAnswered("the run does not answer: its conductor is still starting, or stands still")
             continue
         answer = json.loads(reply.ok.payload.to_bytes())
         if not answer["done"]:

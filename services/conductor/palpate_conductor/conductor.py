@@ -24,6 +24,7 @@ from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, incomplete, unsampled
 from palpate_conductor.watchdog import ContractWatch, FreezeWatch, Heartbeat, RunWatchdog, service_statuses
+from palpate_errors import UserError
 from palpate_inputs import InputError, parse_json
 from palpate_models.scenario.schema import ExamInput
 
@@ -102,7 +103,15 @@ class Conductor:
         self._control.put(self._encode(RunControl(command, tick, last, role, reason)), self._sequence)
 
     def request(self, request: int, reason: str) -> None:
-        """Publish an operator's request for robot, supervisor and planning; see `palpation_msgs/OperatorRequest`."""
+        """Publish an operator's request for robot, supervisor and planning; see `palpation_msgs/OperatorRequest`.
+
+        Before the first tick no service would respond: a stop raises RunFailed, a release UserError.
+        """
+        if not self.started_at:
+            if request == OperatorRequest.RELEASE:
+                raise UserError("the run has not begun, so nothing is stopped")
+            self.abort(reason)
+            raise RunFailed(FailureCode.STOPPED, f"stopped by an operator before the first tick: {reason}")
         port = self._observed.stepper.ports["operator/request"]
         t = max(self._observed.now, 0)
         _, packet = port.pack(OperatorRequest(header(t), request, reason), t)
@@ -198,6 +207,7 @@ class Conductor:
         warned = False
         while len(missing_inputs) < len(self._roles) or any(missing_inputs.values()):
             self._heartbeat.loop_turned()
+            self._operator_requests.poll(None)
             self._watch.poll()  # it receives the hellos, too, and must not fill up
             self._send(RunControl.HELLO)
             sleep(TUNING.handshake_poll_s)

@@ -15,7 +15,7 @@ import zenoh
 from palpate_bus.messages import SupervisorState
 from palpate_bus.runs.operator import CONFIRM_S, TAGGED, TIME_REQUESTS, WORDS, request_key
 from palpate_bus.wire.rmw import Tagger
-from palpate_errors import UserError
+from palpate_errors import RunError, UserError
 from palpate_inputs import parse_json
 
 REQUEST_BYTES = 4096
@@ -42,7 +42,8 @@ class OperatorRequestServer:
         pace: Callable[[str, int], str],
         key: bytes | None = None,
     ) -> None:
-        """`send(request, reason)` publishes a request, see `palpation_msgs/OperatorRequest`.
+        """`send(request, reason)` publishes a request, see `palpation_msgs/OperatorRequest`. It raises UserError to refuse
+        it, and RunError if the request ends the run.
 
         `pace(word, ms)` carries out one of `TIME_REQUESTS` and returns the answer, or raises UserError. With the
         run's `key`, the requests in `TAGGED` need a tag.
@@ -86,7 +87,14 @@ class OperatorRequestServer:
                 done, text = False, str(error)
             self._reply(query, done, text, 0.0)
             return
-        self._send(request, reason)
+        try:
+            self._send(request, reason)
+        except UserError as refused:
+            self._reply(query, False, str(refused), 0.0)
+            return
+        except RunError as ended:
+            self._reply(query, True, str(ended), 0.0)
+            raise
         before = (0, 0) if supervisor is None else (int(supervisor.releases), int(supervisor.refusals))
         self._pending.append(_Pending(query, word, monotonic(), *before))
 

@@ -346,6 +346,16 @@ def test_a_release_is_answered_by_the_next_state(before: Any, after: Any, answer
     assert operated.done
 
 
+def test_a_stop_before_the_first_tick_ends_the_run_and_a_release_is_refused(session: zenoh.Session) -> None:
+    conductor = Conductor(session, contract(), 0, ("control",), Collector(), Patience(start=2.0))
+    queries = Query("release"), Query("stop")
+    for query in queries:
+        conductor._operator_requests._asked.put(query)
+    with pytest.raises(RunFailed, match="stopped by an operator before the first tick: test"):
+        conductor.run()
+    assert [query.answer.get("done") for query in queries] == [False, True]
+
+
 def test_the_conductor_answers_requests_about_time() -> None:
     assert Operated(lambda word, ms: f"{word} {ms}").poll(Query("step", 3)) == (True, "step 3")
     refuse = mock.Mock(side_effect=UserError("wall-clock run"))
