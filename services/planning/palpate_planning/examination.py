@@ -434,6 +434,9 @@ class ExaminationSequence:
         else:
             remainder.unplanned = cause.text if palpation.more else remainder.unplanned  # a search that did not end by itself
             self._correct(out)
+            if lost := now.lost or (now.stop.final and now.stop.cause):
+                course.abort(now, lost._replace(text=f"{lost.text}; the arm stays above the skin"))
+                return
             course.go_home(now, palpation.recovery.failed)
             if cause and not palpation.recovery.failed:
                 self.status.cause, self.status.message = cause, f"returning home: {cause.text}"

@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 class Worker:
-    """The only planning thread of a process: CasADi and OMPL are not thread-safe. A dropped task runs to its end."""
+    """The only planning thread of a process: CasADi and OMPL are not thread-safe. A dropped task that runs is not interrupted."""
 
     def __init__(self) -> None:
         self._start()
@@ -56,6 +56,10 @@ class BackgroundTask(Generic[T]):
         self.begun, self._due = t, t + duration
         self._lockstep = lockstep
         self._future: Future[T] = WORKER.submit(work)
+
+    def __del__(self) -> None:
+        """Take a dropped task out of the worker's queue."""
+        self._future.cancel()
 
     def due(self, t: int) -> bool:
         """Return True if the result is to be used at `t` [ns]."""

@@ -215,6 +215,7 @@ def test_lost_assessment_in_contact_lifts_off() -> None:
     world.steps(100)
     assert world.pressed == 0.0
     assert world.status.cause.reason is Reason.SERVICE_LOST
+    assert world.status.message == "aborted in phase RETRACT: lost assessment; the arm stays above the skin"
 
 
 def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None:

@@ -408,6 +408,14 @@ def test_the_posture_of_a_setpoint_moves_no_faster_than_its_limit() -> None:
     np.testing.assert_array_equal(postures[-1], HOME + 0.5)
 
 
+def test_a_dropped_task_does_not_delay_the_next() -> None:
+    running, done = BackgroundTask(0, 0, lambda: sleep(0.1)), list[int]()
+    dropped = BackgroundTask(0, 0, lambda: done.append(1))
+    del dropped
+    BackgroundTask(0, 0, lambda: None).result()
+    assert running.due(0) and not done
+
+
 def test_a_fork_waits_for_the_planning_thread() -> None:
     future = WORKER.submit(sleep, 0.1)
     if not (child := os.fork()):
