@@ -30,7 +30,9 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
     for item in error.errors()[:_EXPLAINED]:
         field, what = explain_error(item, model)
         path = ".".join(field) or "scenario"
-        lines.append(f"{_origin(name, text, settings, field)}: {path} = {brief(item['input'])}: {what}")
+        of_section = isinstance(item["input"], BaseModel)  # the default section: `what` names the field and its value
+        what = what if of_section else f"{path} = {brief(item['input'])}: {what}"
+        lines.append(f"{_origin(name, text, settings, field)}: {what}")
     return "\n".join(lines)
 
 
