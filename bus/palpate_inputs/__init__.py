@@ -230,7 +230,7 @@ def check_xml(content: _TextT, name: object, error: type[UserError] = InputError
         depth -= 1
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = refuse, begin, end
-    with restate(expat.ExpatError, error, f"{name}: not XML"):
+    with restate(expat.ExpatError, error, f"{name}: not XML in UTF-8 or the encoding that it declares"):
         parser.Parse(content, True)
     return content
 

@@ -200,7 +200,7 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path, scale: str, named: str |
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"text": "<robot"}, "not a URDF"),
+        ({"text": "<robot"}, "arm.urdf: not XML in UTF-8 or the encoding that it declares"),
         ({"text": "<sdf/>"}, "its root element is sdf"),
         ({"text": XACRO}, "has xacro elements"),
         ({"urdf": "other.urdf"}, r"arm\.yaml: urdf: .*other\.urdf: no such file"),
@@ -212,6 +212,14 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path, scale: str, named: str |
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     with pytest.raises(UserError, match=named):
         read_arm(write(tmp_path, **changes))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_urdf_is_read_in_the_encoding_that_it_declares(tmp_path: Path, encoding: str) -> None:
+    name = write(tmp_path)
+    text = (tmp_path / "arm.urdf").read_text().replace('name="arm"', 'name="Ärm"')
+    (tmp_path / "arm.urdf").write_bytes(f"<?xml version='1.0' encoding='{encoding}'?>{text}".encode(encoding))
+    assert read_arm(name)[1] == []
 
 
 def test_a_urdf_in_place_of_its_yaml_file_is_named(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ def check(arm: Name) -> None:
     from palpate.run.clearance import advice, touching
     from palpate_errors import ExitStatus
     from palpate_models.robot.arm import check_arm
+    from palpate_models.robot.urdf_arm import ignored_limits
     from palpate_models.scenario.load import exam_input, load_scenario
     from palpate_models.scenario.schema import DEFAULT_ARM, arm_file
     from palpate_planning.strokes.plan import look_postures
@@ -45,6 +46,10 @@ def check(arm: Name) -> None:
     parts = f"flange {found.link_names[-1]}, elbow {elbow}, {shapes} collision shapes"
     if origin:
         console.print(f"home_rad: {found.home_rad.tolist()}  # {origin}: add this line to keep it, or change it", soft_wrap=True)
+    if given is not None and given.lower_rad is None:
+        for name in filter(ignored_limits(arm).__contains__, found.joint_names):
+            text = "is continuous, so its limits of position in the URDF have no effect: write lower_rad and upper_rad for others"
+            console.print(f"{name}: {text}", soft_wrap=True)
     if not moves and not look_postures(exam_input(scenario), hidden=False):
         console.print("at home, and turned, the arm may hide the region from the camera: try another home_rad", soft_wrap=True)
     console.print(f"usable: {found.joints} joints, {sum(masses):.1f} kg without its base, {parts}", soft_wrap=True)
@@ -80,7 +85,7 @@ def place(
     x, y = robot.base_xy_m
     console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}")
     console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}")
-    draw_reach(out, chosen, targets[0][0], deep.reachable & raised.reachable, (x, y))
+    draw_reach(out, robot, targets[0][0], deep.reachable & raised.reachable)
     if touched:
         say(f"{arm}: {touched}")
     if not look_postures(exam_input(chosen.model_copy(update={"robot": robot}))):

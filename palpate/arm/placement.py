@@ -5,6 +5,7 @@ examined region of the abdomen and a border around it, in contact and raised alo
 patients and registration errors.
 """
 
+from itertools import accumulate
 from operator import itemgetter
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,7 +17,7 @@ from matplotlib.patches import Rectangle
 from palpate.run.clearance import clear_postures, scan_targets
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, Mask
-from palpate_models.robot.arm import BASE_SIDE_M, TABLE, arm_of
+from palpate_models.robot.arm import BASE_SIDE_M, TABLE, arm_of, link_transforms
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement.redundancy import POSTURES, PostureSequence, arm, base_of, casadi, plan_redundancy, surface_frames
 
@@ -135,18 +136,20 @@ def describe(robot: Robot, postures: PostureSequence) -> str:
     )
 
 
-def draw_reach(path: Path, scenario: Scenario, positions: Array, reached: Mask, base_xy: tuple[float, float]) -> None:
-    """Draw the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
+def draw_reach(path: Path, robot: Robot, positions: Array, reached: Mask) -> None:
+    """Draw the arm at home and the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
     figure = Figure(figsize=(6.5, 6.5), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     width, length = TABLE.x_m[1] - TABLE.x_m[0], TABLE.y_m[1] - TABLE.y_m[0]
     axes.add_patch(Rectangle((TABLE.x_m[0], TABLE.y_m[0]), width, length, fill=False, color="#7a8c94", label="table"))
-    corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
-    axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
+    corner = np.array(robot.base_xy_m) - BASE_SIDE_M / 2
+    axes.add_patch(Rectangle((corner[0], corner[1]), BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
+    frames = accumulate((X for *_, X in link_transforms(arm_of(robot).home_rad, robot)), np.matmul)
+    axes.plot(*np.array([X[:2, 3] for X in frames]).T, "o-", lw=4, alpha=0.6, color="#264653", label="links at home")
     for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "not reached")):
         if chosen.any():
             axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
-    title = f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets"
+    title = f"{robot.arm}: {reached.sum()} of {len(reached)} targets"
     axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal", ylim=(-0.6, 0.6))
     axes.legend()
     figure.savefig(path)

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError, restate
-from palpate_inputs import MB, bounds, over, read_text
+from palpate_inputs import MB, bounds, check_xml, over, read_bytes
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_postures
@@ -30,11 +30,8 @@ class UrdfTree:
     """A URDF file. Raises UserError if it is not one."""
 
     def __init__(self, path: Path) -> None:
-        with restate((OSError, ElementTree.ParseError), UserError, f"{path}: not a URDF"):
-            text = read_text(path)
-            if "<!ENTITY" in text:
-                raise UserError(f"{path}: has XML entities, which may name other files: write their text")
-            root = ElementTree.fromstring(text)
+        with restate(OSError, UserError, f"{path}: not a URDF"):
+            root = ElementTree.fromstring(check_xml(read_bytes(path, max_bytes=bounds().document_mb * MB), path))
         if any("xacro" in element.tag for element in root.iter()):
             raise UserError(f"{path}: not a URDF: has xacro elements; expand it with the tool xacro")
         if root.tag != "robot":
@@ -70,6 +67,10 @@ class UrdfTree:
         if len(roots) > 1 and not found:
             found.append(f"links {', '.join(roots)}: {len(roots)} roots, expected one")
         return found
+
+    def shapes(self, link: str) -> list[ElementTree.Element]:
+        """Return the collision shapes of a link, or the visual ones where there is none."""
+        return self.links[link].findall("collision") or self.links[link].findall("visual")
 
     def chain(self, flange: str) -> list[str]:
         """Return the links from the root to the flange. Raises ValueError for a circle."""
@@ -145,10 +146,29 @@ def load_arm(name: str) -> Arm:
 
 def read_arm(name: str) -> tuple[Arm | None, list[str]]:
     """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
-    given, path = arm_file(name), arm_path(name)
-    if not (file := _resolve(given.urdf, path.parent)).is_file():
+    return _Reader(arm_file(name), urdf_path(name)).read(arm_path(name).stem)
+
+
+def urdf_path(name: str) -> Path:
+    """Return the URDF of an arm. Raises UserError."""
+    path = arm_path(name)
+    if not (file := _resolve(arm_file(name).urdf, path.parent)).is_file():
         raise UserError(f"{path}: urdf: {file}: no such file")
-    return _Reader(given, file).read(path.stem)
+    return file
+
+
+def arm_files(name: str) -> list[Path]:
+    """Return the files that decide an arm: its YAML file, URDF and meshes. Raises UserError."""
+    tree, urdf = UrdfTree(urdf_path(name)), urdf_path(name)
+    meshes = (mesh for link in tree.links for shape in tree.shapes(link) for mesh in shape.iter("mesh"))
+    paths = dict.fromkeys(_resolve(mesh.get("filename", ""), urdf.parent) for mesh in meshes)
+    return [arm_path(name), urdf, *filter(Path.is_file, paths)]
+
+
+def ignored_limits(name: str) -> set[str]:
+    """Return the continuous joints with limits of position, which have no effect by the specification of URDF."""
+    joints = UrdfTree(urdf_path(name)).joints
+    return {j.get("name", "") for j in joints if j.get("type") == "continuous" and j.find("limit[@lower]") is not None}
 
 
 def _flange_fault(arm: Arm, given: ArmFile) -> str:
@@ -427,9 +447,8 @@ class _Reader(UrdfTree):
         """Return a capsule about the collision geometry of each link of a group (visual where there is none)."""
         found = []
         for link, X in group:
-            shapes = self.links[link].findall("collision") or self.links[link].findall("visual")
             self.part = f"link {link}"
-            clouds = [points for shape in shapes if len(points := self._points(link, X, shape))]
+            clouds = [points for shape in self.shapes(link) if len(points := self._points(link, X, shape))]
             if clouds:
                 found.append(enclosing_capsule((np.concatenate(clouds) - origin) @ R_BF))
         return tuple(found)
