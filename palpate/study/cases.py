@@ -7,25 +7,25 @@ comparisons are paired, nor on worker and order, so that every way to run the st
 import ast
 import hashlib
 import json
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from itertools import count as count_from
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from palpate.run.roles import check_choices
+from palpate.run.inputs import check_examinable
 from palpate.study.shift import Family, shift_patient
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
-from palpate_errors import UserError
-from palpate_models.patient.mesh import MeshError
-from palpate_models.patient.phantom import build_phantom
+from palpate_bus.recordings import recorded_files
+from palpate_errors import UserError, restate
+from palpate_models.robot.urdf_arm import arm_files
 from palpate_models.scenario.errors import Errors
 from palpate_models.scenario.load import as_settings, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Section
-from palpate_plugins import PluginError, is_file
+from palpate_plugins import is_file
 
 TUNE_SEEDS: Final = 1000
 """Seeds below this are for tuning only."""
@@ -128,10 +128,8 @@ def cases_of(study: Study, request: Request = Request()) -> list[Case]:  # noqa:
 
 def secret_of(path: Path, study: Study) -> str:
     """Return the content of a file of secret seeds. Raises StudyError if it is not the file of the study."""
-    try:
+    with restate(OSError, StudyError, f"--seeds-file {path}"):
         content = path.read_bytes()
-    except OSError as error:
-        raise StudyError(f"--seeds-file {path}: {error.strerror}") from error
     digest = hashlib.sha256(content).hexdigest()
     if study.seeds_sha256 not in (None, digest):
         raise StudyError(f"--seeds-file {path}: its SHA-256 is {digest}; {study.name} expects {study.seeds_sha256}")
@@ -198,51 +196,56 @@ def _scenario(
         changes["errors"] = wrong.model_dump(mode="json")
     changes |= method.settings
     changes |= {f"services.{role}": name for role, name in method.services.items()}
-    try:
+    with restate(UserError, StudyError, where):
         if family is not None:
             changes |= shift_patient(load_scenario(population.scenario, as_settings(changes), seed), family, number)
         return load_scenario(population.scenario, [*as_settings(changes), *settings], seed)
-    except UserError as error:
-        raise StudyError(f"{where}: {error}") from error
 
 
 def _check_usable(where: str, scenario: Scenario) -> Scenario:
-    """Return the scenario with absolute paths of services, after its phantom and its services were checked."""
-    try:
-        build_phantom(scenario.phantom, scenario.seed)
-        return check_choices(scenario)
-    except (PluginError, MeshError) as error:
-        raise StudyError(f"{where}: {error}") from error
+    """Return the scenario with absolute paths of services, after everything was checked that `palpate run` checks."""
+    with restate(UserError, StudyError, where):
+        return check_examinable(scenario)
 
 
 def _files(scenario: Scenario) -> dict[str, str]:
     """Return the SHA-256 of each file that a result depends on, by path."""
-    named = [scenario.phantom.mesh, scenario.phantom.grid, scenario.tissue.fmu, scenario.tissue.fmu_map]
-    functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy, scenario.robot.arm)
-    named += [word for word in functions if is_file(word) or word.endswith(YAML)]
-    return {path: file_hash(path) for path in named if path is not None}
+    phantom, tissue, robot = scenario.phantom, scenario.tissue, scenario.robot
+    chosen = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy, robot.arm)
+    named = [word for word in (*chosen, robot.driver.profile or "") if is_file(word) or word.endswith(YAML)]
+    given = (phantom.mesh, phantom.grid, tissue.fmu, tissue.fmu_map, scenario.camera.recording, *named)
+    return {path: file_hash(path) for path in given if path is not None}
 
 
 @cache
 def file_hash(path: str) -> str:
-    """Return the SHA-256 of a file, of a Python file with the modules of its folder that it imports, of an arm with its URDF.
+    """Return the SHA-256 of a file with what belongs to it: the modules of its folder that a Python file imports, URDF and
+    meshes of an arm; of a folder, that of its recording.
 
-    Raises StudyError if the file cannot be read.
+    Raises StudyError if a file cannot be read.
     """
-    try:
-        own, *imported = [hashlib.sha256(file.read_bytes()).hexdigest() for file in _sources(Path(path))]
-    except OSError as error:
-        raise StudyError(f"{path}: {error.strerror}") from error
+    with restate((OSError, UserError), StudyError, path):
+        own, *imported = [_digest(file) for file in _sources(Path(path))]
     return hashlib.sha256(canonical([own, *imported])).hexdigest() if imported else own
 
 
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _sources(path: Path) -> list[Path]:
-    """Return a file and, if it is Python, the modules of its folder that it imports, and that these import; an arm's URDF."""
+    """Return the files of a folder's recording, or of an arm; else a file and, if it is Python, the modules of its folder that
+    it imports, and that these import.
+    """
+    if path.is_dir():
+        return list(recorded_files(path)[1])
+    if path.name.endswith(YAML):
+        with suppress(UserError):  # another YAML file than that of an arm
+            return arm_files(str(path))
     found = [path]
     for file in found:
-        text = file.read_text(encoding="utf-8", errors="replace") if file.name.endswith((".py", *YAML)) else ""
-        found += [urdf for name in re.findall(r"^urdf: *(\S+)", text, re.M) if (urdf := path.parent / name).is_file()]
-        for name in _imported(text) if is_file(file.name) else ():
+        for name in _imported(file.read_text(encoding="utf-8", errors="replace")) if is_file(file.name) else ():
             near = path.parent / name
             module = near.with_suffix(".py")
             found += [new for new in ([module] if module.is_file() else sorted(near.rglob("*.py"))) if new not in found]

@@ -8,10 +8,11 @@ import pytest
 import yaml
 from synthetic import TOY, study
 
-from palpate.study.cases import Case, Request, cases_of, command_of, file_hash, patient_seeds, secret_of
+from palpate.study.cases import Case, Request, _files, cases_of, command_of, file_hash, patient_seeds, secret_of
 from palpate.study.folder import PACKAGES, SESSIONS, Folder, Outcome, Session, manifest_of, merge
 from palpate.study.runner import _read_attempt, examine_batch
 from palpate.study.spec import Grid, Lumps, Study, StudyError, load_study, study_names, with_services
+from palpate_models.scenario.load import load_scenario
 
 PLAIN = "populations: {a: {scenario: person}}\n"
 
@@ -61,6 +62,7 @@ def test_an_unknown_study_is_answered_with_the_known_ones() -> None:
         ({"lumps": {}}, ("populations.clean", "draw belongs to kind: person")),
         ({"settings": {"services.tissue": "jelly"}}, ("services.tissue", "jelly", "winkler")),
         ({"number": {}}, ("number.test",)),
+        ({"settings": {"exam.mode": "point", "exam.spacing_m": 0.004}}, ("populations.clean", "3480 s is the limit")),
     ],
 )
 def test_a_scenario_that_cannot_be_is_named_with_its_population(changes: dict[str, object], words: tuple[str, ...]) -> None:
@@ -136,7 +138,8 @@ def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, 
         path = tmp_path / folder / "mine.py"
         path.parent.mkdir()
         policy = f"def next_press(posterior, budget): return (0.0, 0.0), 0.00{text}"
-        path.write_text(f"def create(scenario): return {text}\nscan = create\n{policy}\n")
+        scan = f"from palpate_models.scenario.patterns import Scan\ndef scan(exam, surface): return Scan([[[0.0, 0.00{text}]]])"
+        path.write_text(f"def create(scenario): return {text}\n{scan}\n{policy}\n")
         settings = {"exam.pattern": "search"} if field == "search.policy" else {}
         found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
     assert found[0] == found[1] != found[2]
@@ -156,11 +159,26 @@ def test_the_hash_of_a_python_file_includes_the_modules_of_its_folder_that_it_im
     assert file_hash.__wrapped__(str(tmp_path / "mine.py")) != found[2]
 
 
-def test_the_hash_of_an_arm_includes_its_urdf(tmp_path: Path) -> None:
-    arm, urdf = tmp_path / "mine.yaml", tmp_path / "mine.urdf"
-    arm.write_text("urdf: mine.urdf\nflange: tool0\n")
-    found = [file_hash.__wrapped__(str(arm)) for text in ("<robot/>", "<robot />") if urdf.write_text(text)]
-    assert found[0] != found[1]
+def test_the_hash_of_an_arm_includes_its_urdf_and_its_meshes(tmp_path: Path) -> None:
+    arm, urdf, mesh = (tmp_path / name for name in ("mine.yaml", "mine.urdf", "link.stl"))
+    arm.write_text('urdf: "mine.urdf"\nflange: tool0\n')
+    link = '<robot><link name="a"><visual><geometry><mesh filename="link.stl"/></geometry></visual></link></robot>'
+    files = [(urdf, "<robot/>"), (urdf, link), (mesh, "1"), (mesh, "2")]
+    assert len({file_hash.__wrapped__(str(arm)) for file, text in files if file.write_text(text)}) == 4
+
+
+def test_a_recording_and_a_profile_are_files_of_a_case(tmp_path: Path) -> None:
+    profile, recording = tmp_path / "stack.yaml", tmp_path / "recording"
+    recording.mkdir()
+    camera = ["services.camera=replay", f"camera.recording={recording}"]
+    chosen = load_scenario("clean", [f"robot.driver.profile={profile}", *camera])
+    found = set[str]()
+    for text in ("# 1\n", "# 2\n"):
+        profile.write_text(text)
+        (recording / "frames.mcap").write_text(2 * text)
+        file_hash.cache_clear()
+        found |= set(_files(chosen).values())
+    assert len(found) == 4
 
 
 def test_line_separators_in_texts_do_not_end_a_case_and_an_unreadable_line_is_a_failed_attempt() -> None:
