@@ -36,7 +36,8 @@ class ShapeSearch(NamedTuple):
     narrowest: float = 0.5
     """Minimum radius or half width where no anatomy is assumed, over that of the smallest bump."""
     widest: float = 1.3
-    """Maximum radius over the largest one of the bumps that are tried first."""
+    """Maximum radius over the largest one of the bumps that are tried first. Of a ridge of the abdomen: the usual radius, since a
+    scar is narrow and a broad ridge is a lump that is not round."""
     too_near: float = 0.7
     """Two lumps are at least this part of the sum of their radii apart."""
     angles: int = 8
@@ -120,7 +121,8 @@ def _best(
 
     anatomy = regression.observations.standard.anatomy is not None
     narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy and not bumps[0].path else SEARCH.narrowest), lengths.edge_m))
-    widest = np.log((lengths.radii_m[-1] * SEARCH.widest, lengths.wide_edge_m))
+    broadest = lengths.radii_m[SEARCH.usual] if anatomy and bumps[0].path else lengths.radii_m[-1] * SEARCH.widest
+    widest = np.log((broadest, lengths.wide_edge_m))
     low, high = xy.min(axis=0) - lengths.pitch_m, xy.max(axis=0) + lengths.pitch_m
     firsts: list[Bump] = []
     for k in np.argsort(-t, kind="stable"):

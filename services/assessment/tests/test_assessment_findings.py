@@ -7,7 +7,7 @@ import pytest
 from assessment_lines import LEVEL, UP, flat_grid, level, lines, lump, natural, observations, regression
 
 from palpate_assessment.assess import AssessedMap, assess, assess_growing, causes, map_grid, marked_share
-from palpate_assessment.detection import Candidate, Signs, find_disc, limit_strength, match_bumps, signs
+from palpate_assessment.detection import Candidate, Signs, find_disc, find_rival, limit_strength, match_bumps, signs
 from palpate_assessment.model import Regression, fit_log_amplitudes
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump, ridge
@@ -201,6 +201,13 @@ def test_a_ridge_is_named_and_marked_skin_is_believed() -> None:
     plain, marked = (max(r.findings + r.candidates, key=lambda area: area.strength) for r in results)
     assert plain.kinds.argmax() == FindingKind.RIDGE
     assert marked.kinds[FindingKind.RIDGE] > plain.kinds[FindingKind.RIDGE]
+
+
+def test_no_ridge_is_as_broad_as_a_lump() -> None:
+    band = regression(lines(lambda xy: LEVEL + lump(xy * (0.2, 1.0), (0.0, 0.0), 0.025, 2.5)))
+    rival = find_rival(band, Bump(0.0, 0.0, 0.03))
+    assert rival is not None
+    assert rival.radius < 0.019
 
 
 def test_a_short_scar_is_not_lost_in_a_wider_shape_and_a_long_one_counts_where_it_is() -> None:
