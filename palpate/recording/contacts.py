@@ -4,8 +4,10 @@ A recording over time is aligned, tared and cut. A table of probes has no time: 
 The unpressed skin is a smooth height field through the places where contacts begin, as a Gaussian process.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum, auto
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 from warnings import catch_warnings
@@ -71,7 +73,7 @@ def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: A
     found = cutting.cut(readings.time, height, force, sigma)
     if not found.touching:
         faults.append(Fault(FaultCode.NOTHING, 1, 1, Remedy.REFUSED))
-        return Palpated.nothing()
+        return Palpated()
     if found.blind:
         faults.append(Fault(FaultCode.NO_CONTACT, found.blind, found.blind + len(found.touching), Remedy.LEFT_OUT))
     span = float(np.median([np.ptp(height[one]) for one in found.touching]))
@@ -170,7 +172,7 @@ class _Measured:
             kept = self._slide_depths(loads, onsets)
             points, sd = self._skin_points(loads, onsets, kept)
             if not len(points):
-                return Palpated.nothing()._replace(untold=len(self.touching))
+                return Palpated(untold=len(self.touching))
             if not given:
                 self.skin = fit_skin(points, sd, self.stations, 2 * self.reach)
         assert self.skin is not None
@@ -193,8 +195,8 @@ class _Measured:
                 contacts += self._slid(one, kept.get(k))
             elif begin is not None and self.readings.whole[one].any():
                 contacts.append(self._contact(one, load, begin))
-        centres, normals = self.skin.points()
-        return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
+        surface = partial(self.skin.surface, radius=self.radius, margin=self.reach)
+        return Palpated(contacts, surface, self.power, len(self.touching) - len(contacts))
 
     def _slide_depths(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> dict[int, float]:
         """Return the depth that each slide is taken to keep [m]: as it began, or the usual one if that is unlike it."""
@@ -337,7 +339,7 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
             faults.append(Fault(code, int(wrong.sum()), len(rows), Remedy.LEFT_OUT, float(value.max())))
     kept = [one for one, wrong in zip(rows, jumped | empty, strict=True) if not wrong]
     if not kept:
-        return Palpated.nothing()
+        return Palpated()
     inward = [-(p[one] @ n[one][0]) for one in kept]
     begin_at = [-(start[one][0] @ n[one][0]) for one in kept]
     given = readings.touch is not None
@@ -364,12 +366,15 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     points = np.array([contact.position[0] for contact in contacts]).reshape(-1, 3)
     reach = float(np.sqrt(radius * usual))
     if not contacts:
-        return Palpated.nothing()
+        return Palpated()
     if normals is not None and len(points) >= _MANY and width(points) > reach:
-        at = np.array([contact.normal[0] for contact in contacts])
-        return Palpated(contacts, points, at, power, len(kept) - len(contacts))
+        return Palpated(contacts, _first_touched, power, len(kept) - len(contacts))
     skin = fit_skin(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
-    return Palpated(contacts, *skin.points(), power, len(kept) - len(contacts))
+    return Palpated(contacts, partial(skin.surface, radius=0.0, margin=reach), power, len(kept) - len(contacts))
+
+
+def _first_touched(contacts: Sequence[Contact]) -> tuple[Array, Array]:
+    return np.array([contact.position[0] for contact in contacts]), np.array([contact.normal[0] for contact in contacts])
 
 
 _MOST: Final = 300
@@ -404,11 +409,12 @@ class RecordedSkin(NamedTuple):
         spread = RectBivariateSpline(self.x, self.y, self.sd, kx=1, ky=1).ev(*xy.T)
         return surface.ev(*xy.T), normal / np.linalg.norm(normal, axis=1)[:, None], spread
 
-    def points(self) -> tuple[Array, Array]:
-        """Return its nodes [m] and their normals, shape (n, 3) each."""
-        xy = np.stack(np.meshgrid(self.x, self.y, indexing="ij"), axis=-1).reshape(-1, 2)
+    def surface(self, contacts: Sequence[Contact], *, radius: float, margin: float) -> tuple[Array, Array]:
+        """Return points of the skin [m], `radius` below these, over contacts and a margin, and its normals, shape (n, 3) each."""
+        stations = grid_over(np.concatenate([contact.position[:, :2] for contact in contacts]), margin)
+        xy = np.stack(np.meshgrid(*stations, indexing="ij"), axis=-1).reshape(-1, 2)
         z, normal, _ = self.at(xy)
-        return np.column_stack((xy, z)), normal
+        return np.column_stack((xy, z)) - radius * normal, normal
 
     def through(self, points: Array, sd: Array) -> "RecordedSkin":
         """Return the skin moved outward or inward to points of standard deviation `sd` [m], by their weighted mean."""

@@ -1,5 +1,6 @@
 """Files to a `Recording`: reads, cleans, aligns, tares, cuts, finds the skin, and says what was wrong."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -18,6 +19,7 @@ from palpate.recording.recording import (
     ContactKind,
     Fault,
     FaultCode,
+    Palpated,
     PalpationRecording,
     Remedy,
     implied_young,
@@ -284,7 +286,7 @@ def own_recording(folder: Path) -> PalpationRecording:
     )
 
 
-def select_usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
+def select_usable(contacts: Sequence[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
     """Return the contacts that can be assessed; adds faults. `undeep_ones`: contacts that are left out already."""
     usual = float(np.median([contact.depth.max() for contact in contacts])) if contacts else 0.0
 
@@ -393,21 +395,25 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     if palpated.contacts and not is_refused(faults):
         faults += _implausible_force(palpated.contacts, mapping.tool.radius_m)
     touches = [] if is_refused(faults) else select_usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
+    fitted = mapping.body.pose is None and not np.array_equal(X_WA, np.eye(4))
+    if (abdomen := mapping.body.anatomy == "abdomen") and fitted:
+        faults.append(Fault(FaultCode.ANATOMY, 1, 1, Remedy.NO_ANATOMY))
+    surface, normals = palpated.surface(touches) if touches else Palpated().surface(())
     return PalpationRecording(
         name=name,
         indenter_radius_m=mapping.tool.radius_m,
         touches=tuple(touches),
-        surface=palpated.surface,
-        normals=palpated.normals,
+        surface=surface,
+        normals=normals,
         X_WA=X_WA,
         faults=tuple(faults),
-        abdomen=mapping.body.anatomy == "abdomen",
+        abdomen=abdomen and not fitted,
         exponent=palpated.exponent,
     )
 
 
 def _without_contacts(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecording:
-    return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
+    return PalpationRecording(name, mapping.tool.radius_m, faults=tuple(faults))
 
 
 def _inward(readings: Readings, parts: list[slice]) -> bool:
@@ -437,7 +443,7 @@ def _implausible(readings: Readings) -> list[Fault]:
     return faults
 
 
-def _implausible_force(contacts: list[Contact], radius: float) -> list[Fault]:
+def _implausible_force(contacts: Sequence[Contact], radius: float) -> list[Fault]:
     """Return the fault of forces or lengths in another unit: a body that cannot be is refused, one that is rare is a doubt."""
     young, force = implied_young(contacts, radius)
     low, high = LIMITS.young_pa

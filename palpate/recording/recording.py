@@ -1,11 +1,11 @@
 """A recording of palpation, by any robot, as contacts with a body."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from math import sqrt
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -61,6 +61,7 @@ class FaultCode(StrEnum):
     SHALLOW = "shallow", "{count} of {of} contacts are too shallow to be assessed"
     INVALID = "invalid", "{count} of {of} rows have no pose, no number, or a normal of length 0"
     MOVES = "moves", "the skin is {value:.2g} m elsewhere from slide to slide: the body moves, as it does in breathing"
+    ANATOMY = "anatomy", "body.anatomy is abdomen, but its frame was fitted to the contacts: see body.pose of the mapping"
     ZERO = "zero", "the force is {value:.2g} N where probes begin: it was not tared"
 
 
@@ -71,6 +72,7 @@ class Remedy(StrEnum):
     KEPT = "kept as they are"
     CORRECTED = "corrected"
     NOT_TARED = "the force is taken as it is, without a tare"
+    NO_ANATOMY = "no anatomy is assumed"
     ONE_DEPTH = "all slides are taken to keep one depth"
     REFUSED = "not assessed until it is fixed"
 
@@ -134,20 +136,13 @@ class Contact:
 class Palpated(NamedTuple):
     """Contacts and skin found in readings, in A."""
 
-    contacts: list[Contact]
-    surface: Array
-    """[m], shape (n, 3)."""
-    normals: Array
-    """Shape (n, 3)."""
-    exponent: float
+    contacts: Sequence[Contact] = ()
+    surface: Callable[[Sequence[Contact]], tuple[Array, Array]] = lambda contacts: (np.empty((0, 3)), np.empty((0, 3)))
+    """Points [m] and normals of the skin about some of the contacts, shape (n, 3) each."""
+    exponent: float = 1.5
     """Power of depth that the force follows."""
-    untold: int
+    untold: int = 0
     """Contacts whose depth is not known."""
-
-    @classmethod
-    def nothing(cls) -> Self:
-        """Return no contact."""
-        return cls([], np.empty((0, 3)), np.empty((0, 3)), 1.5, 0)
 
 
 class Loading(NamedTuple):
@@ -211,10 +206,10 @@ class PalpationRecording:
 
     name: str
     indenter_radius_m: float
-    touches: tuple[Contact, ...]
-    surface: Array
+    touches: tuple[Contact, ...] = ()
+    surface: Array = field(default_factory=lambda: np.empty((0, 3)))
     """Points of the unpressed skin [m], shape (n, 3), in A."""
-    normals: Array
+    normals: Array = field(default_factory=lambda: np.empty((0, 3)))
     """Outward unit normals there, shape (n, 3)."""
     X_WA: Array = field(default_factory=lambda: np.eye(4))
     """Pose of A in the frame of the recording's positions, shape (4, 4)."""

@@ -26,7 +26,8 @@ from palpate_conductor.outcome import RunResult
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.press import DEPTH_M
+from palpate_models.scenario.schema import Robot, Scenario
 from palpate_models.section import quadrant
 from palpate_planning.reasons import Loss
 
@@ -81,7 +82,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     final = c.findings if c.findings is not None and c.findings.final else None
     findings = [] if final is None else rows.finding_rows(final.findings)
     candidates = [] if final is None else rows.finding_rows(final.candidates)
-    depth = _depth(known)
+    depth, press = _depth(known), (scenario.robot.indenter_radius_m, scenario.exam.depth_m)
     scores = None
     if known.felt is not None and final is not None:
         scores = scoring.score(findings, found, known.felt, candidates)
@@ -118,6 +119,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         candidates=candidates,
         unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else evidence.unassessed_of(c.stiffness_map)),
         background_N=None if c.stiffness_map is None else float(c.stiffness_map.background),
+        standard_press=np.allclose(press, (Robot().indenter_radius_m, DEPTH_M), rtol=0.1),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
         blame=result.blame,
@@ -202,7 +204,7 @@ def describe_unassessed(report: Report) -> str:
 def _level(report: Report) -> str:
     """Return a warning if the whole region is unusually firm or soft."""
     level, (low, high) = report.background_N, USUAL_N
-    if not report.abdomen or level is None or low <= level <= high:
+    if not (report.abdomen and report.standard_press) or level is None or low <= level <= high:
         return ""
     return (
         f"The whole region is unusually {'firm' if level > high else 'soft'}: {level:.1f} N; usual are {low:g} to {high:g} N. A "

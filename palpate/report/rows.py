@@ -230,6 +230,8 @@ class Report(_Row):
     plan), `no_contact`, `force`, `not_tracked`, `moved` (the patient), `operator` (ended it), `fault`, `unfinished` (the run)."""
     background_N: float | None = None
     """Apparent stiffness of the region outside of findings."""
+    standard_press: bool = True
+    """True if indenter and depth are those of the standard press, to which the usual apparent stiffness belongs."""
     truth: TruthRow | None
     scores: Scores | None
     """Null if the run ended before there was anything to score, or if the truth is unknown."""

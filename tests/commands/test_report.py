@@ -34,7 +34,7 @@ from palpate_errors import UserError
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.schema import Robot, Scenario
 
 
 @pytest.fixture(scope="module")
@@ -309,6 +309,12 @@ def whole() -> Report:
 )
 def test_the_verdict_without_findings_states_its_limits(changes: dict[str, Any], said: str, whole: Report) -> None:
     assert said in verdict(whole.model_copy(update={"findings": [], "skipped_targets": 0, **changes}))
+
+
+def test_the_usual_level_is_that_of_the_standard_press() -> None:
+    wide = SCENARIO.model_copy(update={"robot": Robot(indenter_radius_m=0.03)})
+    report = assemble(wide, result(collected()), NOTHING).model_copy(update={"background_N": 7.0})
+    assert "unusually" not in verdict(report)
 
 
 def test_the_verdict_states_a_probable_tensed_muscle(whole: Report) -> None:

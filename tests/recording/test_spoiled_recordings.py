@@ -9,11 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate.interface.assessment import assess
-from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
+from palpate.recording.mapping import ForceSource, MappedBody, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
 from palpate.recording.readings import Readings, from_table
 from palpate.recording.recording import FaultCode, PalpationRecording
 from palpate_assessment.standard import places_of
+from palpate_models.section import Pose
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))
@@ -240,6 +241,23 @@ def test_a_fault_is_named_and_adds_no_finding(pressed: pd.DataFrame, probed: pd.
     if name in ASSESSED:
         reach, places = 0.015, assess(recording).findings[["x_m", "y_m"]].to_numpy()
     assert np.all(np.linalg.norm(places - (-0.055, -0.055), axis=1) < reach)
+
+
+def test_a_calibration_touch_far_away_is_left_out_of_the_map_too(pressed: pd.DataFrame) -> None:
+    touch = pressed[pressed.press == 0]
+    shallow = touch.assign(x=touch.x + 1.2, z=touch.z.clip(lower=touch.z.min() + 0.0095), t=touch.t + pressed.t.max() + 1.0)
+    recording = read(pd.concat((pressed, shallow)), OVER_TIME)
+    assert [fault.code for fault in recording.faults] == [FaultCode.SHALLOW]
+    assert np.ptp(recording.surface, axis=0).max() < 0.2
+    assert len(assess(recording).findings) == 1
+
+
+@pytest.mark.parametrize("pose", [None, Pose(rpy_rad=(np.pi / 2, 0.0, 0.0))])
+def test_an_abdomen_in_a_fitted_frame_is_no_abdomen(pressed: pd.DataFrame, pose: Pose | None) -> None:
+    lying = pressed.assign(y=-pressed.z, z=pressed.y, fy=-pressed.fz, fz=pressed.fy)
+    recording = read(lying, mapped(OVER_TIME, body=MappedBody(pose=pose, anatomy="abdomen")))
+    assert recording.abdomen is (pose is not None)
+    assert (FaultCode.ANATOMY in [fault.code for fault in recording.faults]) is (pose is None)
 
 
 def test_slides_over_a_body_that_breathes_keep_one_depth() -> None:
