@@ -234,13 +234,19 @@ class Bus:
         if reader == VIEWER:
             open_key = topic_key(RULES.topics["joint_states"], 0)
         arrived: set[str] = set()
-        handler = zenoh.handlers.Callback(lambda sample: arrived.add(str(sample.key_expr)), indirect=False)
+        payload = sender.encode()  # a message of the case before may still be under way
+
+        def note(sample: zenoh.Sample) -> None:
+            if sample.payload.to_bytes() == payload:
+                arrived.add(str(sample.key_expr))
+
+        handler = zenoh.handlers.Callback(note, indirect=False)
         to, of = self.join(reader), self.join(sender)
         subscribers = [to.declare_subscriber(name, handler) for name in dict.fromkeys((key, open_key))]
 
         def sent() -> bool:
             for name in (key, open_key):
-                of.put(name, b"x")
+                of.put(name, payload)
             return open_key in arrived
 
         assert wait_until(sent), "the way was never open"
