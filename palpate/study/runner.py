@@ -17,7 +17,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -203,9 +203,12 @@ def open_workers(count: int, scheduler: str | None = None) -> Iterator[Workers]:
 
     Local workers are threads because each case is examined in a process of its own.
     """
-    from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second
+    import dask  # noqa: PLC0415 - takes a second
+    from distributed import Client, LocalCluster  # noqa: PLC0415
 
     with ExitStack() as stack:
+        if scheduler is None:  # after a computer's sleep its own worker counted as lost, and the study waited for ever
+            stack.enter_context(dask.config.set({"distributed.scheduler.worker-ttl": None}))
         stack.enter_context(warnings.catch_warnings())
         warnings.filterwarnings("ignore", "Port .* is already in use")  # by another study; the address is printed anyway
         try:
@@ -236,8 +239,9 @@ def open_workers(count: int, scheduler: str | None = None) -> Iterator[Workers]:
 def _kill_case_processes() -> None:
     """End the case processes of an interrupted study, so that the threads that wait for them end."""
     for child in psutil.Process().children():
-        if "palpate.study.runner" in child.cmdline():
-            child.kill()
+        with suppress(psutil.NoSuchProcess):  # it has just ended
+            if "palpate.study.runner" in child.cmdline():
+                child.kill()
 
 
 def select_shard(cases: Sequence[Case], shard: str) -> list[Case]:

@@ -136,6 +136,11 @@ def test_a_study_continues_after_its_scheduler_was_killed(
     assert digest_of(examined(tmp_path, CASES)) == digest_of(folder)
 
 
+def test_a_study_that_stood_still_keeps_its_own_worker() -> None:
+    with open_workers(1) as workers:
+        assert workers.client.cluster.scheduler.worker_ttl is None  # else Dask drops the worker after a computer's sleep
+
+
 def test_a_study_continues_after_its_command_was_killed(folder: Path, tmp_path: Path) -> None:
     """Killed when the first case is done, then called again; what is done is not done again."""
     out = tmp_path / "out"
