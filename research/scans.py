@@ -13,12 +13,14 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
 
+from palpate.exam_state import exam_state
 from palpate.report.evidence import felt_truth, map_of
 from palpate.report.rows import Scores, finding_rows
 from palpate.report.scoring import Truth, score
 from palpate.truth.pressed import Touched, TrueBody, press_patient
 from palpate_assessment.service import AssessmentService
-from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3, header
+from palpate_bus.messages import ExamState, SurfaceMesh, header
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.field import gaussian_field
 from palpate_models.patient.phantom import PhantomModel, build_phantom
@@ -36,27 +38,11 @@ FORCE_SD = 0.03
 """Noise of the force at 100 Hz [N]."""
 
 
-class StepInbox:
-    """Messages of a step, by topic."""
-
-    def __init__(self, messages: dict[str, list[Any]]) -> None:
-        self._messages = messages
-
-    def new(self, topic: str) -> list[Any]:
-        """See `service.Inbox`."""
-        return self._messages.get(topic, [])
-
-    def latest(self, topic: str) -> Any | None:
-        """See `service.Inbox`."""
-        return (self._messages.get(topic) or [None])[-1]
-
-    def stamp(self, topic: str) -> int | None:
-        """See `service.Inbox`; nothing is stamped."""
-        return None
-
-    def lost(self, role: str) -> bool:
-        """See `service.Inbox`; nothing is lost."""
-        return False
+def step_inbox(messages: dict[str, list[Any]]) -> HandInbox:
+    """Return the inbox of a step with messages by topic."""
+    inbox = HandInbox()
+    inbox.events, inbox.messages = dict(messages), {topic: rows[-1] for topic, rows in messages.items() if rows}
+    return inbox
 
 
 @dataclass(frozen=True)
@@ -171,30 +157,9 @@ def scan(
 def _state(t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, stroke: int) -> Any:
     p_W = apply(X_WA, p[None])[0]
     n_W = X_WA[:3, :3] @ n
-    return ExamState(
-        header=header(round(t * 1e9), "world"),
-        phase=ExamState.PHASE_SCAN,
-        message="",
-        target_index=0,
-        target_count=0,
-        targets_skipped=0,
-        in_contact=force > 0.2,
-        steady=steady,
-        force_limited=False,
-        view_blocked=False,
-        depth_setpoint=0.01,
-        depth=depth,
-        normal_force=force,
-        surface_point=Point(*map(float, p_W)),
-        surface_normal=Vector3(*map(float, n_W)),
-        end_tick=-1,
-        depth_uncertainty=SURFACE_SD,
-        wall_displacement=0.0,
-        stroke=stroke,
-        patient_moved=False,
-        reason=0,
-        culprit="",
-    )
+    measured = {"depth_setpoint": 0.01, "depth": depth, "normal_force": force, "depth_uncertainty": SURFACE_SD, "stroke": stroke}
+    t_ns, touching = round(t * 1e9), force > 0.2
+    return exam_state(t_ns, ExamState.PHASE_SCAN, p_W, n_W, in_contact=touching, steady=steady, **measured)
 
 
 def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
@@ -205,7 +170,7 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
     surface = [data.surface]
     for state in data.states:
         t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        outbox = service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
+        outbox = service.step(t, step_inbox({"exam/state": [state], "perception/surface": surface}))
         surface = []
         samples += outbox.get("assessment/samples", [])
         stiffness_map = outbox.get("assessment/map", stiffness_map)

@@ -5,12 +5,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit
-from sklearn.metrics import brier_score_loss
 
 from palpate.study.statistics.detectability import fit
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Drawn, Estimate, Row, estimate
+from palpate.study.statistics.estimate import Array, Bootstrap, Drawn, Estimate, Row, estimate
 from palpate.study.statistics.reading import Variant
-from palpate_models.numerics.seeds import generator
 
 NORMAL: Final = 1.959964
 """Between -NORMAL and NORMAL lie 95 % of a standard normal variable."""
@@ -169,10 +167,6 @@ class FindingCalibration(Row):
     expected_error: Estimate
     """Mean distance of hits from confidence over ten bins of equal number (Naeini et al., AAAI 2015). Resampling adds a bias,
     whose mean is subtracted from the interval."""
-    expected_error_by_chance: float
-    """95 % quantile over studies with calibrated confidences (Broecker and Smith, Weather Forecast 2007;22:651)."""
-    brier: Estimate
-    """Mean square of confidence minus hit (Brier 1950)."""
     bins: tuple[tuple[float, Estimate], ...] = Drawn
     """Mean confidence and share of hits of each bin, for the reliability diagram."""
 
@@ -189,7 +183,7 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | 
     slope, slopes = _slope(p, hit, drawn)
     with np.errstate(invalid="ignore", divide="ignore"):
         weights = drawn.sum(axis=1)
-        gaps, squares = drawn @ (hit - p) / weights, drawn @ (p - hit) ** 2 / weights
+        gaps = drawn @ (hit - p) / weights
     error = float(_expected_error(p, hit, label, np.ones((1, len(p))))[0])
     errors = _expected_error(p, hit, label, drawn)
     errors = np.maximum(errors - np.nanmean(errors) + error, 0)
@@ -197,8 +191,6 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | 
         slope=estimate(slope, slopes, len(p), "areas"),
         in_the_large=estimate(float(np.mean(hit - p)), gaps, len(p), "areas"),
         expected_error=estimate(error, errors, len(p), "areas"),
-        expected_error_by_chance=_by_chance(p, label),
-        brier=estimate(float(brier_score_loss(hit, p, labels=[False, True])), squares, len(p), "areas"),
         bins=tuple(
             (float(p[b].mean()), bootstrap.share(hit[b], patient[b], "areas")) for b in label == np.unique(label)[:, None]
         ),
@@ -218,11 +210,6 @@ def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], d
     gaps = np.abs(np.add.reduceat(drawn * (hit - p), first, axis=1)).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(gaps / drawn.sum(axis=1), dtype=np.float64)
-
-
-def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
-    hit = generator(0, "hits by their confidence").random((FOLDS, len(p))) < p
-    return float(np.quantile(_expected_error(p, hit, label, np.ones((1, len(p)))), LEVEL))
 
 
 def _slope(p: Array, hit: NDArray[np.bool_], drawn: Array) -> tuple[float, Array]:

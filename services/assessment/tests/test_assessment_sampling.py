@@ -28,7 +28,7 @@ from palpate_bus.service import Outbox
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam, Scenario
-from research.scans import Scan, StepInbox, examine, random_lesion, scan, scenario_with, scored, truth_of
+from research.scans import Scan, examine, random_lesion, scan, scenario_with, scored, step_inbox, truth_of
 
 UP = np.array((0.0, 0.0, 1.0))
 
@@ -281,7 +281,9 @@ def played(service: AssessmentService, states: Sequence[Any], surface: Any = Non
     steps = []
     for state in states:
         t = nanoseconds(state.header.stamp)
-        steps.append((t, service.step(t, StepInbox({"exam/state": [state], "perception/surface": [surface] if surface else []}))))
+        steps.append(
+            (t, service.step(t, step_inbox({"exam/state": [state], "perception/surface": [surface] if surface else []})))
+        )
         surface = None
     return steps
 
@@ -297,7 +299,7 @@ def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
 
 def test_an_examination_without_samples_ends_with_no_findings(small: Scan) -> None:
     service = create(small.scenario)
-    outbox = service.step(10_000_000, StepInbox({"exam/state": [small.states[-1]]}))
+    outbox = service.step(10_000_000, step_inbox({"exam/state": [small.states[-1]]}))
     assert outbox["assessment/findings"].final
     assert outbox["assessment/findings"].findings == []
     assert "assessment/map" not in outbox
@@ -308,7 +310,7 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
     played(service, small.states[: len(small.states) // 2], small.surface)
     last = small.states[-1]
     aborted = replace(last, phase=ExamState.PHASE_ABORTED)
-    outbox = service.step(60_000_000_000, StepInbox({"exam/state": [aborted]}))
+    outbox = service.step(60_000_000_000, step_inbox({"exam/state": [aborted]}))
     assert outbox["assessment/findings"].final
     assert 0.2 < outbox["assessment/map"].scanned.mean() < 0.8
 
@@ -330,7 +332,7 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
     service = create(small.scenario)
     wrong = replace(small.surface, header=replace(small.surface.header, frame_id="camera"))
     with pytest.raises(ValueError, match="perception/surface"):
-        service.step(0, StepInbox({"perception/surface": [wrong]}))
+        service.step(0, step_inbox({"perception/surface": [wrong]}))
 
 
 def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) -> None:
@@ -345,14 +347,14 @@ def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) ->
     ]
     known = exam_input(small.scenario)
     live, later = AssessmentService(known), AssessmentService(known)
-    live.step(first, StepInbox({"perception/surface": [surface]}))
+    live.step(first, step_inbox({"perception/surface": [surface]}))
     coming = list(motions)
     for state in states:
         t, seen = nanoseconds(state.header.stamp), []
         while coming and nanoseconds(coming[0].header.stamp) + 100_000_000 <= t:
             seen.append(coming.pop(0))
-        live.step(t, StepInbox({"exam/state": [state], "perception/motion": seen}))
-    later.step(last, StepInbox({"exam/state": states, "perception/motion": motions, "perception/surface": [surface]}))
+        live.step(t, step_inbox({"exam/state": [state], "perception/motion": seen}))
+    later.step(last, step_inbox({"exam/state": states, "perception/motion": motions, "perception/surface": [surface]}))
     count = len(live.samples)
     assert count > 50
     assert [sample.depth for sample in later.samples[:count]] == [sample.depth for sample in live.samples]

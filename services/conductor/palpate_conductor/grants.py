@@ -136,8 +136,10 @@ class Grants:
         if request == "pause":
             self._paused_at = self._paused_at if self.paused else monotonic()
             self.paused = True
-        elif not self.paused or self.horizon == NEVER:
-            raise UserError("the run is not paused" if self.horizon != NEVER else "the run has not begun")
+        elif self.horizon == NEVER:
+            raise UserError("the run has not begun")
+        elif not self.paused:
+            raise UserError("the run is not paused")
         elif request == "resume":
             self.paused = False
             self._paced_from, self._paced_since = self.horizon, monotonic()
