@@ -2,18 +2,14 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from typer.testing import CliRunner
 
 from palpate.arm.command import app
-from palpate.arm.placement import best_placement, draw_reach
+from palpate.arm.placement import best_placement
 from palpate.commands import app_for
 from palpate.run.inputs import check_usable
 from palpate_errors import RunError, UserError
-from palpate_models.robot.arm import arm_of, tool_pose
 from palpate_models.scenario.load import load_scenario
 
 ROBOTS = "urdf: package://example-robot-data/robots"
@@ -75,16 +71,6 @@ def test_limits_of_a_continuous_joint_are_said_to_have_no_effect(tmp_path: Path)
     turned = f"{KINOVA}flange_rpy_rad: [0.0, 1.5708, 0.0]\n"
     said = "j2s6s200_joint_1: is continuous, so its limits of position in the URDF have no effect"
     assert said in check(tmp_path, turned)
-
-
-def test_the_picture_of_a_place_has_the_links_from_the_base_to_the_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Line2D] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path: drawn.extend(figure.axes[0].lines))
-    robot = load_scenario("lump").robot
-    draw_reach(tmp_path / "place.png", robot, np.zeros((1, 3)), np.ones(1, bool))
-    links = np.array(drawn[0].get_xydata())
-    np.testing.assert_allclose(links[0], robot.base_xy_m)
-    np.testing.assert_allclose(links[-1], tool_pose(arm_of(robot).home_rad, robot)[:2, 3])
 
 
 def test_a_home_posture_that_touches_is_replaced_by_one_that_is_clear(tmp_path: Path) -> None:
